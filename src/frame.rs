@@ -1,0 +1,67 @@
+//! Pictures with a time: frames, the keyframes kept of them, and batches of keyframes.
+
+use std::sync::Arc;
+
+use crate::camera::Intrinsics;
+use crate::clock::Stamp;
+use crate::pose::Rigid;
+
+/// 8-bit sRGB, rows top to bottom, `pixels.len() == 3 * width_px * height_px`.
+#[derive(Clone, PartialEq, Eq)]
+pub struct RgbImage {
+    pub width_px: u32,
+    pub height_px: u32,
+    pub pixels: Vec<u8>,
+}
+
+impl std::fmt::Debug for RgbImage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "RgbImage({}x{})", self.width_px, self.height_px)
+    }
+}
+
+/// z-depth along the camera axis, in the length unit of whoever made it; 0 = no value.
+/// `confidence` is 0 (unverified: never use) to 1, one per pixel; only its order means anything between models.
+#[derive(Clone, PartialEq)]
+pub struct DepthMap {
+    pub width_px: u32,
+    pub height_px: u32,
+    pub depth: Vec<f32>,
+    pub confidence: Vec<f32>,
+}
+
+impl std::fmt::Debug for DepthMap {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "DepthMap({}x{})", self.width_px, self.height_px)
+    }
+}
+
+/// One picture from the world, already undistorted to the pinhole `intrinsics` when the calibration is known.
+#[derive(Debug, Clone)]
+pub struct Frame {
+    /// Counts from 0 in the order of arrival; gaps mean dropped or undecodable frames.
+    pub seq: u64,
+    pub stamp: Stamp,
+    pub image: Arc<RgbImage>,
+    /// `None`: the camera is uncalibrated and geometry must estimate the focal length.
+    pub intrinsics: Option<Intrinsics>,
+    /// Ground truth where the source has it (`world_from_cam`, OpenCV axes). Only `geometry::known` and `eval` may look.
+    pub truth: Option<Rigid>,
+    /// Exact depth where the source has it (synthetic scenes and their recordings), at image size or smaller.
+    pub truth_depth: Option<Arc<DepthMap>>,
+}
+
+/// A frame that the map keeps. Ids count from 0 without gaps, in order of time.
+#[derive(Debug, Clone)]
+pub struct Keyframe {
+    pub id: u32,
+    pub frame: Frame,
+}
+
+/// Keyframes for one inference; the first `n_shared` were in the batch before.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    pub id: u32,
+    pub n_shared: usize,
+    pub keyframes: Vec<Arc<Keyframe>>,
+}

@@ -1,0 +1,58 @@
+//! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
+
+use crate::camera::Intrinsics;
+use crate::frame::{Batch, DepthMap};
+use crate::pose::Rigid;
+
+/// How far a view can be trusted.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Health {
+    /// Landmarks (or matches) that agree with the pose.
+    pub n_inliers: u32,
+    /// Median triangulation angle of those, in degrees; 0 where unknown.
+    pub parallax_deg: f64,
+    /// Median reprojection error in pixels of the working picture; 0 where unknown.
+    pub reprojection_px: f64,
+}
+
+/// One keyframe that the model placed.
+#[derive(Debug, Clone)]
+pub struct View {
+    pub keyframe_id: u32,
+    /// Views with equal numbers share one frame and scale; different numbers have no known relation.
+    pub component: u32,
+    pub intrinsics: Intrinsics,
+    pub batch_from_cam: Rigid,
+    /// In the unit of `batch_from_cam`. May be smaller than the picture; same field of view.
+    pub depth: DepthMap,
+    pub health: Health,
+}
+
+/// What a model says of one batch. Keyframes that cannot be placed are absent, never guessed; a model that keeps
+/// state may deliver them with a later batch, and may revise poses it gave before.
+#[derive(Debug, Clone, Default)]
+pub struct GeometryBatch {
+    pub batch_id: u32,
+    /// Newly placed keyframes (of this batch or left over from earlier ones) and the shared ones again.
+    pub views: Vec<View>,
+    /// Keyframes of earlier batches whose pose changed, in the same frame as `views`: (keyframe id, component, batch_from_cam).
+    pub revised: Vec<(u32, u32, Rigid)>,
+    /// Why keyframes are missing, one plain sentence, for status and errors.
+    pub note: Option<String>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum GeometryError {
+    #[error("{model} needs {needs} for keyframe {keyframe_id}, found none; {way_out}")]
+    Missing { model: &'static str, needs: &'static str, keyframe_id: u32, way_out: &'static str },
+    #[error("{name:?} is no geometry; expected sfm or known")]
+    UnknownModel { name: String },
+}
+
+/// Estimates cameras and depth. One thread owns it; calls come in order of batches.
+pub trait GeometryModel: Send {
+    fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError>;
+
+    /// Called once after the last batch: whatever can still be placed or improved.
+    fn finish(&mut self) -> Result<GeometryBatch, GeometryError>;
+}

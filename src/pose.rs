@@ -1,0 +1,114 @@
+//! Rigid motions and similarities in f64, named `target_from_source`.
+//!
+//! Knows nothing of cameras or maps. Quaternions here are glam's; the stored order elsewhere is w,x,y,z.
+
+use glam::{DMat3, DQuat, DVec3};
+
+/// `p_target = rotation * p_source + translation`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rigid {
+    pub rotation: DQuat,
+    pub translation: DVec3,
+}
+
+/// `p_target = scale * rotation * p_source + translation`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Similarity {
+    pub scale: f64,
+    pub rotation: DQuat,
+    pub translation: DVec3,
+}
+
+impl Rigid {
+    pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
+
+    pub fn new(rotation: DQuat, translation: DVec3) -> Self {
+        Self { rotation, translation }
+    }
+
+    pub fn inverse(&self) -> Self {
+        let rotation = self.rotation.conjugate();
+        Self { rotation, translation: -(rotation * self.translation) }
+    }
+
+    pub fn transform_point(&self, point: DVec3) -> DVec3 {
+        self.rotation * point + self.translation
+    }
+
+    pub fn rotation_matrix(&self) -> DMat3 {
+        DMat3::from_quat(self.rotation)
+    }
+
+    /// Exponential map of se(3): `rho` translates, `theta` rotates (radians). Small angles use the series.
+    pub fn exp(rho: DVec3, theta: DVec3) -> Self {
+        let angle = theta.length();
+        let skew = skew(theta);
+        let (b, c) = if angle < 1e-5 {
+            (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
+        } else {
+            ((1.0 - angle.cos()) / (angle * angle), (angle - angle.sin()) / (angle * angle * angle))
+        };
+        let v = DMat3::IDENTITY + skew * b + skew * skew * c;
+        Self { rotation: DQuat::from_scaled_axis(theta), translation: v * rho }
+    }
+
+    /// Angle in radians of the rotation that takes `self` to `other`.
+    pub fn angle_to(&self, other: &Self) -> f64 {
+        let dot = self.rotation.dot(other.rotation).abs().min(1.0);
+        // acos loses all digits near 1, the sine of the difference does not.
+        let relative = self.rotation.conjugate() * other.rotation;
+        let sine = DVec3::new(relative.x, relative.y, relative.z).length();
+        2.0 * sine.atan2(dot)
+    }
+
+    pub fn is_finite(&self) -> bool {
+        self.rotation.is_finite() && self.translation.is_finite()
+    }
+
+    /// Products of many rotations lose unit length; this restores it.
+    pub fn renormalized(&self) -> Self {
+        Self { rotation: self.rotation.normalize(), translation: self.translation }
+    }
+}
+
+impl std::ops::Mul for Rigid {
+    type Output = Self;
+
+    fn mul(self, rhs: Self) -> Self {
+        Self {
+            rotation: self.rotation * rhs.rotation,
+            translation: self.rotation * rhs.translation + self.translation,
+        }
+    }
+}
+
+impl Similarity {
+    pub const IDENTITY: Self = Self { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
+
+    pub fn inverse(&self) -> Self {
+        let rotation = self.rotation.conjugate();
+        let scale = 1.0 / self.scale;
+        Self { scale, rotation, translation: -(rotation * self.translation) * scale }
+    }
+
+    pub fn transform_point(&self, point: DVec3) -> DVec3 {
+        self.rotation * point * self.scale + self.translation
+    }
+
+    /// `self * source_from_cam`: the camera keeps unit scale, only its place and heading move.
+    pub fn transform_pose(&self, pose: &Rigid) -> Rigid {
+        Rigid {
+            rotation: self.rotation * pose.rotation,
+            translation: self.transform_point(pose.translation),
+        }
+    }
+}
+
+/// `skew(a) * b == a.cross(b)`.
+pub fn skew(a: DVec3) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::new(0.0, a.z, -a.y),
+        DVec3::new(-a.z, 0.0, a.x),
+        DVec3::new(a.y, -a.x, 0.0),
+    )
+}

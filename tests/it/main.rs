@@ -1,0 +1,4 @@
+//! All integration tests in one binary: one link of the dependencies.
+#![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
+
+mod scenes;
