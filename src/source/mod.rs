@@ -2,6 +2,8 @@
 //!
 //! A source hands out decoded, undistorted frames in order of arrival and counts what it could not use.
 
+pub mod synthetic;
+
 use std::path::PathBuf;
 
 use crate::frame::Frame;
