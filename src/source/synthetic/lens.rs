@@ -33,7 +33,10 @@ pub(super) fn lens(kind: LensKind, width_px: u32, height_px: u32, fov_deg: f64) 
         LensKind::Radial => Distortion::PlumbBob(BARREL),
         LensKind::Fisheye => Distortion::Equidistant(FISHEYE),
     };
-    Lens { intrinsics, distortion }
+    Lens {
+        intrinsics,
+        distortion,
+    }
 }
 
 /// Place on the plane z = 1 -> place where the lens shows it, still in units of the focal length.
@@ -51,11 +54,19 @@ pub(super) fn distort(distortion: &Distortion, at: DVec2) -> DVec2 {
     };
     match *distortion {
         Distortion::None => at,
-        Distortion::PlumbBob([k1, k2, p1, p2, k3]) => brown([k1, k2, k3, 0.0, 0.0, 0.0, 0.0, 0.0], [p1, p2]),
-        Distortion::Rational([k1, k2, p1, p2, k3, k4, k5, k6]) => brown([k1, k2, k3, k4, k5, k6, 0.0, 0.0], [p1, p2]),
+        Distortion::PlumbBob([k1, k2, p1, p2, k3]) => {
+            brown([k1, k2, k3, 0.0, 0.0, 0.0, 0.0, 0.0], [p1, p2])
+        }
+        Distortion::Rational([k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            brown([k1, k2, k3, k4, k5, k6, 0.0, 0.0], [p1, p2])
+        }
         Distortion::Equidistant(k) => {
             let radius = at.length();
-            if radius < 1e-12 { at } else { at * (bent_angle(k, radius.atan()) / radius) }
+            if radius < 1e-12 {
+                at
+            } else {
+                at * (bent_angle(k, radius.atan()) / radius)
+            }
         }
     }
 }
@@ -63,7 +74,8 @@ pub(super) fn distort(distortion: &Distortion, at: DVec2) -> DVec2 {
 /// Pixel of a point in front of the camera.
 pub(super) fn project(lens: &Lens, point_in_cam: DVec3) -> Option<DVec2> {
     let flat = (point_in_cam.z > 1e-9).then(|| point_in_cam.truncate() / point_in_cam.z)?;
-    lens.intrinsics.project(distort(&lens.distortion, flat).extend(1.0))
+    lens.intrinsics
+        .project(distort(&lens.distortion, flat).extend(1.0))
 }
 
 /// Unit direction of the light that falls on a pixel.
@@ -74,7 +86,11 @@ pub(super) fn ray_in_cam(lens: &Lens, pixel: DVec2) -> DVec3 {
         Distortion::Equidistant(k) => {
             let bent = shown.length();
             let angle = straight_angle(k, bent);
-            let out = if bent < 1e-12 { DVec2::ZERO } else { shown / bent };
+            let out = if bent < 1e-12 {
+                DVec2::ZERO
+            } else {
+                shown / bent
+            };
             (out * angle.sin()).extend(angle.cos())
         }
         Distortion::PlumbBob(_) | Distortion::Rational(_) => {
@@ -93,7 +109,8 @@ fn straight_angle(k: [f64; 4], bent: f64) -> f64 {
     let mut angle = bent;
     for _ in 0..8 {
         let a2 = angle * angle;
-        let slope = 1.0 + a2 * (3.0 * k[0] + a2 * (5.0 * k[1] + a2 * (7.0 * k[2] + a2 * 9.0 * k[3])));
+        let slope =
+            1.0 + a2 * (3.0 * k[0] + a2 * (5.0 * k[1] + a2 * (7.0 * k[2] + a2 * 9.0 * k[3])));
         angle -= (bent_angle(k, angle) - bent) / slope.max(0.1);
     }
     angle
@@ -120,9 +137,18 @@ mod tests {
 
     #[test]
     fn a_pixel_is_where_its_own_ray_projects() {
-        for (kind, fov_deg) in [(LensKind::Pinhole, 66.0), (LensKind::Radial, 80.0), (LensKind::Fisheye, 120.0)] {
+        for (kind, fov_deg) in [
+            (LensKind::Pinhole, 66.0),
+            (LensKind::Radial, 80.0),
+            (LensKind::Fisheye, 120.0),
+        ] {
             let lens = lens(kind, 640, 480, fov_deg);
-            for pixel in [DVec2::new(0.5, 0.5), DVec2::new(321.0, 238.0), DVec2::new(639.5, 479.5), DVec2::new(40.0, 300.0)] {
+            for pixel in [
+                DVec2::new(0.5, 0.5),
+                DVec2::new(321.0, 238.0),
+                DVec2::new(639.5, 479.5),
+                DVec2::new(40.0, 300.0),
+            ] {
                 let back = project(&lens, 3.0 * ray_in_cam(&lens, pixel)).unwrap();
                 assert!(back.distance(pixel) < 1e-8, "{kind:?} {pixel} -> {back}");
             }
