@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
-use crate::clock::Stamp;
+use crate::clock::{Stamp, Stopwatch};
 use crate::pose::Rigid;
 
 /// 8-bit sRGB, rows top to bottom, `pixels.len() == 3 * width_px * height_px`.
@@ -56,6 +56,8 @@ pub struct Frame {
 pub struct Keyframe {
     pub id: u32,
     pub frame: Frame,
+    /// Runs since the frame was selected: latencies in reports.
+    pub age: Stopwatch,
 }
 
 /// Keyframes for one inference; the first `n_shared` were in the batch before.
