@@ -47,14 +47,25 @@ impl Intrinsics {
 
     /// Point with z = 1 on the ray through a pixel.
     pub fn ray_in_cam(&self, pixel: DVec2) -> DVec3 {
-        DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+        DVec3::new(
+            (pixel.x - self.cx) / self.fx,
+            (pixel.y - self.cy) / self.fy,
+            1.0,
+        )
     }
 
     /// The same camera with its picture resized; a resize may change the aspect.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
         let sy = f64::from(height_px) / f64::from(self.height_px);
-        Self { width_px, height_px, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
+        Self {
+            width_px,
+            height_px,
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+        }
     }
 
     /// Finite, positive focal lengths and a principal point within one picture of the centre.
@@ -63,7 +74,11 @@ impl Intrinsics {
         let longest = w.max(h);
         let focal_fits = |f: f64| f.is_finite() && f > 0.05 * longest && f < 100.0 * longest;
         let centre_fits = |c: f64, side: f64| c.is_finite() && c > -side && c < 2.0 * side;
-        w > 0.0 && h > 0.0 && focal_fits(self.fx) && focal_fits(self.fy)
-            && centre_fits(self.cx, w) && centre_fits(self.cy, h)
+        w > 0.0
+            && h > 0.0
+            && focal_fits(self.fx)
+            && focal_fits(self.fy)
+            && centre_fits(self.cx, w)
+            && centre_fits(self.cy, h)
     }
 }

@@ -52,7 +52,12 @@ struct LastKeyframe {
 
 impl std::fmt::Debug for LastKeyframe {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "LastKeyframe({} of {} tracks)", self.tracks.len(), self.n_corners)
+        write!(
+            f,
+            "LastKeyframe({} of {} tracks)",
+            self.tracks.len(),
+            self.n_corners
+        )
     }
 }
 
@@ -69,7 +74,12 @@ enum Motion {
 
 impl Selector {
     pub fn new(params: SelectParams) -> Self {
-        Self { params, next_id: 0, last: None, sharpness: VecDeque::new() }
+        Self {
+            params,
+            next_id: 0,
+            last: None,
+            sharpness: VecDeque::new(),
+        }
     }
 
     /// Returns the frame as a keyframe when the map should keep it.
@@ -89,7 +99,8 @@ impl Selector {
                 // A blurry frame loses its tracks too; the next sharp one finds them still lost.
                 Motion::Lost => is_sharp,
                 Motion::Median(flow) => {
-                    flow >= self.params.min_flow && (is_sharp || flow >= self.params.min_flow + self.params.max_wait)
+                    flow >= self.params.min_flow
+                        && (is_sharp || flow >= self.params.min_flow + self.params.max_wait)
                 }
             };
             if too_soon || !moved {
@@ -103,7 +114,11 @@ impl Selector {
     fn keep(&mut self, frame: Frame) -> Keyframe {
         let id = self.next_id;
         self.next_id += 1;
-        Keyframe { id, frame, age: Stopwatch::start() }
+        Keyframe {
+            id,
+            frame,
+            age: Stopwatch::start(),
+        }
     }
 
     fn is_sharp(&mut self, sharpness: f32) -> bool {
@@ -121,7 +136,12 @@ impl Selector {
 impl LastKeyframe {
     fn new(stamp_secs: f64, grey: Image<f32, 1>) -> Self {
         let corners = corners(&grey);
-        Self { stamp_secs, n_corners: corners.len(), tracks: corners.into_iter().map(|c| (c, c)).collect(), grey }
+        Self {
+            stamp_secs,
+            n_corners: corners.len(),
+            tracks: corners.into_iter().map(|c| (c, c)).collect(),
+            grey,
+        }
     }
 
     /// Follows the corners into the next frame and says how far they are from where the keyframe had them.
@@ -130,25 +150,42 @@ impl LastKeyframe {
             // A blank keyframe measures no motion; the first frame with something to see takes its place.
             let sees_more = corners(&grey).len() >= 2 * MIN_CORNERS.max(self.n_corners);
             self.grey = grey;
-            return if sees_more { Motion::Lost } else { Motion::Unknown };
+            return if sees_more {
+                Motion::Lost
+            } else {
+                Motion::Unknown
+            };
         }
         let (width, height) = (grey.width() as f32, grey.height() as f32);
         let from: Vec<[f32; 2]> = self.tracks.iter().map(|(_, at)| *at).collect();
-        let Some(to) = track(&self.grey, &grey, &from) else { return Motion::Unknown };
+        let Some(to) = track(&self.grey, &grey, &from) else {
+            return Motion::Unknown;
+        };
         let positions: Vec<[f32; 2]> = to.iter().map(|t| t.unwrap_or([-1.0, -1.0])).collect();
         let back = track(&grey, &self.grey, &positions).unwrap_or_default();
         let returned = |i: usize| {
-            back.get(i).copied().flatten().is_some_and(|b| distance(b, from[i]) <= MAX_RETURN_PX)
+            back.get(i)
+                .copied()
+                .flatten()
+                .is_some_and(|b| distance(b, from[i]) <= MAX_RETURN_PX)
         };
         let inside = |p: [f32; 2]| p[0] >= 0.0 && p[1] >= 0.0 && p[0] < width && p[1] < height;
         self.tracks = (0..from.len())
-            .filter_map(|i| to[i].filter(|p| inside(*p) && returned(i)).map(|p| (self.tracks[i].0, p)))
+            .filter_map(|i| {
+                to[i]
+                    .filter(|p| inside(*p) && returned(i))
+                    .map(|p| (self.tracks[i].0, p))
+            })
             .collect();
         self.grey = grey;
         if (self.tracks.len() as f64) < MIN_SURVIVORS * self.n_corners as f64 {
             return Motion::Lost;
         }
-        let mut motion: Vec<f32> = self.tracks.iter().map(|(start, at)| distance(*start, *at)).collect();
+        let mut motion: Vec<f32> = self
+            .tracks
+            .iter()
+            .map(|(start, at)| distance(*start, *at))
+            .collect();
         motion.sort_by(f32::total_cmp);
         Motion::Median(f64::from(motion[motion.len() / 2] / width.max(height)))
     }
@@ -190,7 +227,11 @@ impl Batcher {
         let shared = self.keyframes.len().saturating_sub(self.overlap);
         let rest = self.keyframes[shared..].to_vec();
         let keyframes = std::mem::replace(&mut self.keyframes, rest);
-        let batch = Batch { id: self.next_id, n_shared: self.n_shared, keyframes };
+        let batch = Batch {
+            id: self.next_id,
+            n_shared: self.n_shared,
+            keyframes,
+        };
         self.next_id += 1;
         self.n_shared = self.keyframes.len();
         batch
@@ -200,7 +241,9 @@ impl Batcher {
 /// Grey 0..1, box-filtered down to at most `TRACK_SIDE_PX`.
 fn small_grey(image: &RgbImage) -> Image<f32, 1> {
     let (width, height) = (image.width_px as usize, image.height_px as usize);
-    let factor = (image.width_px.max(image.height_px)).div_ceil(TRACK_SIDE_PX).max(1) as usize;
+    let factor = (image.width_px.max(image.height_px))
+        .div_ceil(TRACK_SIDE_PX)
+        .max(1) as usize;
     let (small_width, small_height) = ((width / factor).max(1), (height / factor).max(1));
     let norm = 1.0 / (255.0 * 4.0 * (factor * factor) as f32);
     let mut grey = Vec::with_capacity(small_width * small_height);
@@ -219,7 +262,10 @@ fn small_grey(image: &RgbImage) -> Image<f32, 1> {
             grey.push(sum as f32 * norm);
         }
     }
-    let size = ImageSize { width: small_width, height: small_height };
+    let size = ImageSize {
+        width: small_width,
+        height: small_height,
+    };
     Image::new(size, grey).expect("one value per pixel")
 }
 
@@ -234,7 +280,8 @@ fn sharpness(grey: &Image<f32, 1>) -> f32 {
     for y in 1..height - 1 {
         for x in 1..width - 1 {
             let p = y * width + x;
-            let laplacian = f64::from(at[p - 1] + at[p + 1] + at[p - width] + at[p + width] - 4.0 * at[p]);
+            let laplacian =
+                f64::from(at[p - 1] + at[p + 1] + at[p - width] + at[p + width] - 4.0 * at[p]);
             sum += laplacian;
             sum_sq += laplacian * laplacian;
         }
@@ -246,18 +293,29 @@ fn sharpness(grey: &Image<f32, 1>) -> f32 {
 /// The strongest corner of each grid cell (Shi-Tomasi).
 fn corners(grey: &Image<f32, 1>) -> Vec<[f32; 2]> {
     let (width, height) = (grey.width(), grey.height());
-    let Ok(mut response) = Image::from_size_val(grey.size(), 0.0_f32) else { return Vec::new() };
-    if width < 2 * CELL_PX || height < 2 * CELL_PX || gftt_response(grey, &mut response, 3, 5, false).is_err() {
+    let Ok(mut response) = Image::from_size_val(grey.size(), 0.0_f32) else {
+        return Vec::new();
+    };
+    if width < 2 * CELL_PX
+        || height < 2 * CELL_PX
+        || gftt_response(grey, &mut response, 3, 5, false).is_err()
+    {
         return Vec::new();
     }
     let response = response.as_slice();
     let mut found = Vec::new();
     for cell_y in (0..height).step_by(CELL_PX) {
         for cell_x in (0..width).step_by(CELL_PX) {
-            let (ys, xs) = (cell_y..(cell_y + CELL_PX).min(height), cell_x..(cell_x + CELL_PX).min(width));
+            let (ys, xs) = (
+                cell_y..(cell_y + CELL_PX).min(height),
+                cell_x..(cell_x + CELL_PX).min(width),
+            );
             let pixels = ys.flat_map(|y| xs.clone().map(move |x| (x, y)));
-            let best = pixels.max_by(|a, b| response[a.1 * width + a.0].total_cmp(&response[b.1 * width + b.0]));
-            if let Some((x, y)) = best.filter(|(x, y)| response[y * width + x] > MIN_CORNER_RESPONSE) {
+            let best = pixels
+                .max_by(|a, b| response[a.1 * width + a.0].total_cmp(&response[b.1 * width + b.0]));
+            if let Some((x, y)) =
+                best.filter(|(x, y)| response[y * width + x] > MIN_CORNER_RESPONSE)
+            {
                 found.push([x as f32, y as f32]);
             }
         }
@@ -266,14 +324,26 @@ fn corners(grey: &Image<f32, 1>) -> Vec<[f32; 2]> {
 }
 
 /// Where each point went; `None` where the track was lost.
-fn track(from: &Image<f32, 1>, to: &Image<f32, 1>, points: &[[f32; 2]]) -> Option<Vec<Option<[f32; 2]>>> {
+fn track(
+    from: &Image<f32, 1>,
+    to: &Image<f32, 1>,
+    points: &[[f32; 2]],
+) -> Option<Vec<Option<[f32; 2]>>> {
     let longest = from.width().max(from.height());
     // The coarsest level keeps about 40 pixels, so that motion of a tenth of the picture stays within its window.
     let max_level = (longest / 40).max(1).ilog2() as usize;
-    let params = PyrLKParams { max_level, max_iter: 15, ..PyrLKParams::default() };
+    let params = PyrLKParams {
+        max_level,
+        max_iter: 15,
+        ..PyrLKParams::default()
+    };
     let result = calc_optical_flow_pyr_lk(from, to, points, None, &params).ok()?;
     let tracked = |i: usize| result.status[i] == 1 && result.error[i] < MAX_TRACK_ERROR;
-    Some((0..points.len()).map(|i| tracked(i).then(|| result.next_pts[i])).collect())
+    Some(
+        (0..points.len())
+            .map(|i| tracked(i).then(|| result.next_pts[i]))
+            .collect(),
+    )
 }
 
 fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
@@ -297,7 +367,9 @@ mod tests {
         for y in 0..height_px {
             for x in 0..width_px {
                 let (u, v) = (f64::from(x) + shift_px, f64::from(y));
-                let wave = (u * 0.31).sin() * (v * 0.23).cos() + (u * 0.11 + v * 0.17).sin() + (u * 0.047 - v * 0.05).cos();
+                let wave = (u * 0.31).sin() * (v * 0.23).cos()
+                    + (u * 0.11 + v * 0.17).sin()
+                    + (u * 0.047 - v * 0.05).cos();
                 let level = (128.0 + 30.0 * contrast * wave) as u8;
                 pixels.extend_from_slice(&[level; 3]);
             }
@@ -305,7 +377,11 @@ mod tests {
         Frame {
             seq,
             stamp: Stamp::from_secs(seq as f64 * 0.2),
-            image: Arc::new(RgbImage { width_px, height_px, pixels }),
+            image: Arc::new(RgbImage {
+                width_px,
+                height_px,
+                pixels,
+            }),
             intrinsics: None,
             truth: None,
             truth_depth: None,
@@ -314,7 +390,11 @@ mod tests {
 
     fn kept(frames: impl IntoIterator<Item = Frame>, params: SelectParams) -> Vec<u64> {
         let mut selector = Selector::new(params);
-        frames.into_iter().filter_map(|f| selector.push(f)).map(|k| k.frame.seq).collect()
+        frames
+            .into_iter()
+            .filter_map(|f| selector.push(f))
+            .map(|k| k.frame.seq)
+            .collect()
     }
 
     #[test]
@@ -325,38 +405,79 @@ mod tests {
     #[test]
     fn motion_of_min_flow_makes_a_keyframe() {
         // 8 px a frame, 25.6 px needed: every fourth frame.
-        assert_eq!(kept((0..12).map(|i| frame(i, 8.0 * i as f64, 1.0)), params()), [0, 4, 8]);
+        assert_eq!(
+            kept((0..12).map(|i| frame(i, 8.0 * i as f64, 1.0)), params()),
+            [0, 4, 8]
+        );
     }
 
     #[test]
     fn a_blank_wall_makes_no_keyframes() {
-        assert_eq!(kept((0..10).map(|i| frame(i, 10.0 * i as f64, 0.0)), params()), [0]);
+        assert_eq!(
+            kept((0..10).map(|i| frame(i, 10.0 * i as f64, 0.0)), params()),
+            [0]
+        );
     }
 
     #[test]
     fn the_rate_cap_holds_and_select_all_overrides_it() {
-        let slow = SelectParams { max_rate_hz: 1.0, ..params() };
-        assert_eq!(kept((0..12).map(|i| frame(i, 15.0 * i as f64, 1.0)), slow.clone()), [0, 5, 10]);
-        assert_eq!(kept((0..4).map(|i| frame(i, 0.0, 1.0)), SelectParams { all: true, ..slow }).len(), 4);
+        let slow = SelectParams {
+            max_rate_hz: 1.0,
+            ..params()
+        };
+        assert_eq!(
+            kept(
+                (0..12).map(|i| frame(i, 15.0 * i as f64, 1.0)),
+                slow.clone()
+            ),
+            [0, 5, 10]
+        );
+        assert_eq!(
+            kept(
+                (0..4).map(|i| frame(i, 0.0, 1.0)),
+                SelectParams { all: true, ..slow }
+            )
+            .len(),
+            4
+        );
     }
 
     #[test]
     fn a_blurry_frame_waits_for_a_sharper_one() {
         let frames = (0..10).map(|i| frame(i, 8.0 * i as f64, if i == 4 { 0.2 } else { 1.0 }));
-        let ids = kept(frames, SelectParams { max_wait: 0.2, ..params() });
+        let ids = kept(
+            frames,
+            SelectParams {
+                max_wait: 0.2,
+                ..params()
+            },
+        );
         assert_eq!(ids[..2], [0, 5], "{ids:?}");
     }
 
     #[test]
     fn batches_overlap_and_the_last_one_is_short() {
-        let select = SelectParams { all: true, batch_size: 4, batch_overlap: 1, ..params() };
+        let select = SelectParams {
+            all: true,
+            batch_size: 4,
+            batch_overlap: 1,
+            ..params()
+        };
         let (mut selector, mut batcher) = (Selector::new(select.clone()), Batcher::new(&select));
-        let mut batches: Vec<Batch> =
-            (0..8).filter_map(|i| selector.push(frame(i, 0.0, 1.0))).filter_map(|k| batcher.push(k)).collect();
+        let mut batches: Vec<Batch> = (0..8)
+            .filter_map(|i| selector.push(frame(i, 0.0, 1.0)))
+            .filter_map(|k| batcher.push(k))
+            .collect();
         batches.extend(batcher.finish());
-        let ids: Vec<Vec<u32>> = batches.iter().map(|b| b.keyframes.iter().map(|k| k.id).collect()).collect();
+        let ids: Vec<Vec<u32>> = batches
+            .iter()
+            .map(|b| b.keyframes.iter().map(|k| k.id).collect())
+            .collect();
         assert_eq!(ids, [vec![0, 1, 2, 3], vec![3, 4, 5, 6], vec![6, 7]]);
-        assert_eq!(batches.iter().map(|b| b.n_shared).collect::<Vec<_>>(), [0, 1, 1]);
+        assert_eq!(
+            batches.iter().map(|b| b.n_shared).collect::<Vec<_>>(),
+            [0, 1, 1]
+        );
         assert!(batcher.finish().is_none());
     }
 }

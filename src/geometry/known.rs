@@ -29,15 +29,24 @@ impl Known {
             way_out: "use --geometry sfm",
         };
         let frame = &keyframe.frame;
-        let truth = frame.truth.ok_or_else(|| missing("a ground truth pose (PoseStamped or tf)"))?;
+        let truth = frame
+            .truth
+            .ok_or_else(|| missing("a ground truth pose (PoseStamped or tf)"))?;
         let intrinsics = frame.intrinsics.ok_or_else(|| missing("a CameraInfo"))?;
-        let depth = frame.truth_depth.as_ref().ok_or_else(|| missing("a depth picture of equal stamp"))?;
+        let depth = frame
+            .truth_depth
+            .as_ref()
+            .ok_or_else(|| missing("a depth picture of equal stamp"))?;
         // One stream of numbers per keyframe: a shared keyframe gets the same noise in every batch.
         let mut rng = Pcg64Mcg::seed_from_u64(self.seed ^ (u64::from(keyframe.id) << 20));
         let median = median_depth(depth);
         let angle = self.params.rotation_noise_deg.to_radians();
-        let mut normal3 = |std: f64| DVec3::new(normal(&mut rng), normal(&mut rng), normal(&mut rng)) * std;
-        let (theta, rho) = (normal3(angle), normal3(self.params.translation_noise * median));
+        let mut normal3 =
+            |std: f64| DVec3::new(normal(&mut rng), normal(&mut rng), normal(&mut rng)) * std;
+        let (theta, rho) = (
+            normal3(angle),
+            normal3(self.params.translation_noise * median),
+        );
         let batch_from_cam = truth * Rigid::exp(rho, theta);
         Ok(View {
             keyframe_id: keyframe.id,
@@ -52,8 +61,17 @@ impl Known {
 
 impl GeometryModel for Known {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
-        let views = batch.keyframes.iter().map(|keyframe| self.view(keyframe)).collect::<Result<_, _>>()?;
-        Ok(GeometryBatch { batch_id: batch.id, views, revised: Vec::new(), note: None })
+        let views = batch
+            .keyframes
+            .iter()
+            .map(|keyframe| self.view(keyframe))
+            .collect::<Result<_, _>>()?;
+        Ok(GeometryBatch {
+            batch_id: batch.id,
+            views,
+            revised: Vec::new(),
+            note: None,
+        })
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
@@ -73,7 +91,12 @@ fn noisy_depth(depth: &DepthMap, std: f32, rng: &mut Pcg64Mcg) -> DepthMap {
 }
 
 fn median_depth(depth: &DepthMap) -> f64 {
-    let mut valid: Vec<f32> = depth.depth.iter().copied().filter(|d| *d > 0.0 && d.is_finite()).collect();
+    let mut valid: Vec<f32> = depth
+        .depth
+        .iter()
+        .copied()
+        .filter(|d| *d > 0.0 && d.is_finite())
+        .collect();
     if valid.is_empty() {
         return 1.0;
     }

@@ -21,8 +21,15 @@ pub struct SourceCounts {
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     #[error("cannot open {what}: {reason}; {way_out}: {}", path.display())]
-    Open { what: &'static str, reason: String, way_out: &'static str, path: PathBuf },
-    #[error("{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder")]
+    Open {
+        what: &'static str,
+        reason: String,
+        way_out: &'static str,
+        path: PathBuf,
+    },
+    #[error(
+        "{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder"
+    )]
     Uri { uri: String },
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
     NoImageTopic { found: String, path: PathBuf },
