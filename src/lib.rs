@@ -4,21 +4,38 @@
 //! modules above it (`tests/it/layers.rs` checks). One direction:
 //! `Frame -> Batch -> GeometryBatch -> SplatMap -> Arc<Snapshot> -> publishers`.
 
-pub mod camera;
-pub mod cli;
 pub mod clock;
+
 pub mod config;
-pub mod eval;
-pub mod export;
-pub mod frame;
-pub mod geometry;
-pub mod gpu;
-pub mod map;
-pub mod node;
+
 pub mod pose;
-pub mod publish;
+
+pub mod camera;
+
 pub mod queue;
+
+pub mod frame;
+
 pub mod ros;
-pub mod select;
+
 pub mod source;
+
+pub mod select;
+
+pub mod geometry;
+
+pub mod gpu;
+
 pub mod splat;
+
+pub mod map;
+
+pub mod publish;
+
+pub mod export;
+
+pub mod eval;
+
+pub mod node;
+
+pub mod cli;

@@ -27,7 +27,7 @@ use crate::pose::Similarity;
 use crate::splat::{Engine, Rendering, StepSettings, TrainingView};
 
 /// Keyframes without a pose that are kept in case the model places them later.
-const MAX_WAITING: usize = 200;
+pub const MAX_WAITING: usize = 200;
 /// Steps between looks at a view for holes and errors, and between removals of transparent splats.
 const RESEED_EVERY: u64 = 50;
 const PRUNE_EVERY: u64 = 400;
@@ -170,6 +170,7 @@ impl SplatMap {
 
     /// Moves each held-out view, alone and with the splats frozen, to where its picture fits best.
     pub fn refine_held_out(&mut self) {
+        self.note_loss();
         let held_out: Vec<usize> = self
             .keyframes
             .placed
@@ -229,6 +230,10 @@ impl SplatMap {
             .into_iter()
             .chain(foreign.into_values())
             .collect()
+    }
+
+    pub fn has_keyframe(&self, keyframe_id: u32) -> bool {
+        self.keyframes.placed.contains_key(&keyframe_id)
     }
 
     pub fn n_splats(&self) -> usize {

@@ -64,6 +64,11 @@ impl Schedule {
     }
 }
 
+/// Steps of the whole run that should be done when this share of the input has come.
+pub fn due(params: &MapParams, progress: f64) -> u64 {
+    (params.steps as f64 * (1.0 - params.final_share) * progress.clamp(0.0, 1.0)) as u64
+}
+
 /// Numbers of one step. `scene_depth` is the median depth of the views in map units: lengths scale with it.
 pub fn settings(params: &MapParams, scene_depth: f32, phase: Phase) -> StepSettings {
     let done = match phase {

@@ -3,11 +3,15 @@
 //! The embedded file is the only home of defaults and ranges: the structs below have neither. A user's file or
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
+mod range;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use serde_json::Value;
+
+use crate::config::range::{Range, ranges_of_comments};
 
 /// The shipped `launch/params.yaml`.
 pub const PARAMS_YAML: &str = include_str!("../launch/params.yaml");
@@ -151,62 +155,6 @@ pub struct PublishParams {
     pub namespace: String,
     pub chunk_bytes: usize,
     pub linger_secs: f64,
-}
-
-/// What a value may be, read from the comment behind its default.
-#[derive(Debug, Clone, PartialEq)]
-enum Range {
-    Number { min: f64, max: f64 },
-    Choice(Vec<String>),
-    Flag,
-    Text,
-}
-
-impl Range {
-    fn of_comment(comment: &str) -> Option<Self> {
-        if let Some(rest) = comment.strip_prefix('[') {
-            let (min, max) = rest.split_once(']')?.0.split_once(',')?;
-            return Some(Self::Number {
-                min: min.trim().parse().ok()?,
-                max: max.trim().parse().ok()?,
-            });
-        }
-        if let Some(rest) = comment.strip_prefix('{') {
-            let names = rest.split_once('}')?.0.split(',');
-            return Some(Self::Choice(
-                names.map(|name| name.trim().to_owned()).collect(),
-            ));
-        }
-        if comment.starts_with("flag") {
-            return Some(Self::Flag);
-        }
-        comment.starts_with("text").then_some(Self::Text)
-    }
-
-    /// `whole`: the default is an integer, so values must be too.
-    fn allows(&self, value: &Value, whole: bool) -> bool {
-        match self {
-            Self::Number { min, max } => value
-                .as_f64()
-                .is_some_and(|v| v >= *min && v <= *max && !(whole && v.fract() != 0.0)),
-            Self::Choice(names) => value
-                .as_str()
-                .is_some_and(|v| names.iter().any(|name| name == v)),
-            Self::Flag => value.is_boolean(),
-            Self::Text => value.is_string(),
-        }
-    }
-}
-
-impl std::fmt::Display for Range {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Number { min, max } => write!(f, "a number in [{min}, {max}]"),
-            Self::Choice(names) => write!(f, "one of {}", names.join(", ")),
-            Self::Flag => write!(f, "true or false"),
-            Self::Text => write!(f, "text"),
-        }
-    }
 }
 
 /// Values by dotted key; every key of the embedded file is there.
@@ -380,96 +328,5 @@ fn flatten(prefix: &str, tree: &Value, out: &mut BTreeMap<String, Value>) {
     }
 }
 
-/// Reads the ranges out of the comments of the embedded file, which we write ourselves: two levels, two spaces each.
-fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
-    let mut group = String::new();
-    let mut ranges = BTreeMap::new();
-    for line in text.lines() {
-        let trimmed = line.trim_start();
-        let indent = line.len() - trimmed.len();
-        let Some((name, rest)) = trimmed.split_once(':') else {
-            continue;
-        };
-        if indent < 4 || trimmed.starts_with('#') {
-            continue;
-        }
-        let key = if indent == 4 {
-            name.to_owned()
-        } else {
-            format!("{group}.{name}")
-        };
-        match rest
-            .split_once(" # ")
-            .and_then(|(_, comment)| Range::of_comment(comment.trim()))
-        {
-            Some(range) => {
-                ranges.insert(key, range);
-            }
-            None => group = name.to_owned(),
-        }
-    }
-    ranges
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn shipped_values_fit_their_own_ranges_and_the_structs() {
-        let settings = Settings::shipped();
-        for (key, value) in &settings.values {
-            let (range, whole) = &settings.ranges[key];
-            assert!(
-                range.allows(value, *whole),
-                "{key} = {value} is outside {range}"
-            );
-        }
-        settings.params().unwrap();
-    }
-
-    #[test]
-    fn every_numeric_bound_can_be_set_and_read_back() {
-        for key in Settings::shipped().values.keys() {
-            let mut settings = Settings::shipped();
-            if let (Range::Number { min, max }, _) = settings.ranges[key].clone() {
-                settings.set(key, Value::from(min)).unwrap();
-                settings.set(key, Value::from(max)).unwrap();
-                let fits = settings.params();
-                assert!(
-                    matches!(fits, Ok(_) | Err(ConfigError::Overlap { .. })),
-                    "{key}: {fits:?}"
-                );
-                settings.set(key, Value::from(max + 1.0)).unwrap_err();
-            }
-        }
-    }
-
-    #[test]
-    fn errors_name_key_value_and_range() {
-        let mut settings = Settings::shipped();
-        let message = |e: ConfigError| e.to_string();
-        let high = message(settings.merge_setting("map.sh_degree=4").unwrap_err());
-        assert_eq!(
-            high,
-            "parameter map.sh_degree = 4 is out of range, expected a number in [0, 3] (whole)"
-        );
-        let unknown = message(settings.merge_setting("step=4").unwrap_err());
-        assert!(
-            unknown.contains("\"step\"") && unknown.contains("map.steps"),
-            "{unknown}"
-        );
-        assert!(message(settings.merge_setting("steps").unwrap_err()).contains("key=value"));
-        assert!(settings.merge_setting("backend=cuda").is_err());
-    }
-
-    #[test]
-    fn a_whole_number_is_fine_where_a_fraction_may_stand() {
-        let mut settings = Settings::shipped();
-        settings.merge_setting("select.min_flow=1").unwrap();
-        settings.merge_setting("publish.namespace=7").unwrap();
-        settings.merge_setting("map.steps=5e2").unwrap();
-        let params = settings.params().unwrap();
-        assert_eq!((params.select.min_flow, params.map.steps), (1.0, 500));
-    }
-}
+mod tests;
