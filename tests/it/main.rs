@@ -1,6 +1,8 @@
 //! All integration tests in one binary: one link of the dependencies.
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+mod eval;
 mod layers;
+mod report;
 mod scenes;
 mod shaders;
