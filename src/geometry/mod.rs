@@ -1,6 +1,7 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
 pub mod known;
+pub mod mvs;
 
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};
