@@ -9,6 +9,7 @@ pub mod config;
 pub mod pose;
 pub mod camera;
 pub mod queue;
+pub mod atomic;
 pub mod frame;
 pub mod ros;
 pub mod source;

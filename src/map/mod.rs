@@ -1,3 +1,5 @@
 //! The map.
 
+pub mod checkpoint;
+pub mod layout;
 pub mod snapshot;
