@@ -14,6 +14,7 @@ pub mod camera;
 
 pub mod queue;
 
+pub mod atomic;
 pub mod frame;
 
 pub mod ros;

@@ -302,6 +302,9 @@ macro_rules! transform_defs {
     };
 }
 
+// `publish/wire.rs` completes the definitions of msgs/ with these.
+pub(crate) use {header_def, pose_def, quaternion_def, separator, time_def, vector_defs};
+
 impl Message for Image {
     const TYPE_NAME: &'static str = "sensor_msgs/msg/Image";
     const DEFINITION: &'static str = concat!(

@@ -8,6 +8,8 @@ pub mod keyframes;
 mod revise;
 pub mod schedule;
 pub mod seed;
+pub mod checkpoint;
+pub mod layout;
 pub mod snapshot;
 
 use std::sync::Arc;

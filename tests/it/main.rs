@@ -2,7 +2,9 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod eval;
+mod formats;
 mod layers;
+mod publish;
 mod report;
 mod scenes;
 mod shaders;
