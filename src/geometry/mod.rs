@@ -1,5 +1,14 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
+pub mod scale_space;
+pub mod features;
+pub mod matching;
+pub mod triangulate;
+pub mod two_view;
+pub mod pnp;
+pub mod bundle;
+pub mod sfm;
+
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};
 use crate::pose::Rigid;

@@ -2,3 +2,5 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod scenes;
+mod sfm;
+mod sfm_measure;
