@@ -2,6 +2,14 @@
 
 pub mod known;
 pub mod mvs;
+pub mod scale_space;
+pub mod features;
+pub mod matching;
+pub mod triangulate;
+pub mod two_view;
+pub mod pnp;
+pub mod bundle;
+pub mod sfm;
 
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};

@@ -7,4 +7,6 @@ mod layers;
 mod publish;
 mod report;
 mod scenes;
+mod sfm;
+mod sfm_measure;
 mod shaders;
