@@ -3,5 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod gradients;
+mod hostile_splats;
 mod reference;
+mod render;
 mod scenes;

@@ -35,9 +35,31 @@ pub struct Projected {
     pub is_dark: [bool; 3],
 }
 
+/// Splats nearer or fainter than this are not drawn.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    pub near: f64,
+    pub min_opacity: f64,
+}
+
+pub const LIMITS: Limits = Limits {
+    near: NEAR,
+    min_opacity: MIN_OPACITY,
+};
+
+/// What is drawn, in the order of splats.
 pub fn project(params: &Params, camera: &Camera, sh_degree: u8) -> Vec<Projected> {
+    project_within(params, camera, sh_degree, LIMITS)
+}
+
+pub fn project_within(
+    params: &Params,
+    camera: &Camera,
+    sh_degree: u8,
+    limits: Limits,
+) -> Vec<Projected> {
     (0..params.means.len())
-        .filter_map(|splat_ix| project_one(params, splat_ix, camera, sh_degree))
+        .filter_map(|splat_ix| project_one(params, splat_ix, camera, sh_degree, limits))
         .collect()
 }
 
@@ -46,6 +68,7 @@ fn project_one(
     splat_ix: usize,
     camera: &Camera,
     sh_degree: u8,
+    limits: Limits,
 ) -> Option<Projected> {
     let mean = Vector3::from(params.means[splat_ix]);
     let log_scale = Vector3::from(params.log_scales[splat_ix]);
@@ -66,7 +89,7 @@ fn project_one(
 
     let mean_in_cam = camera.rotation * mean + camera.translation;
     let opacity = sigmoid(logit);
-    if mean_in_cam.z <= NEAR || opacity < MIN_OPACITY {
+    if mean_in_cam.z <= limits.near || opacity < limits.min_opacity {
         return None;
     }
 
@@ -163,7 +186,10 @@ fn jacobian(camera: &Camera, z: f64, slope: Vector2<f64>) -> Matrix2x3<f64> {
 
 /// Where `opacity exp(-d^2 / 2)` falls to `MIN_OPACITY`, in standard deviations, then in whole pixels.
 fn radius_px(opacity: f64, covariance_px: &Matrix2<f64>) -> Vector2<f64> {
-    let extent = (2.0 * (opacity / MIN_OPACITY).ln()).sqrt().min(3.33);
+    let extent = (2.0 * (opacity / MIN_OPACITY).ln())
+        .max(0.0)
+        .sqrt()
+        .min(3.33);
     Vector2::new(covariance_px.m11, covariance_px.m22)
         .map(|variance| (extent * variance.sqrt()).ceil())
 }
