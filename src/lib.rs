@@ -15,6 +15,7 @@ pub mod camera;
 pub mod queue;
 
 pub mod atomic;
+
 pub mod frame;
 
 pub mod ros;

@@ -83,6 +83,15 @@ impl Rigid {
         self.rotation.is_finite() && self.translation.is_finite()
     }
 
+    /// Between `self` (share 0) and `other` (share 1): straight and at even speed, the short way round.
+    pub fn between(&self, other: &Self, share: f64) -> Self {
+        let same_side = if self.rotation.dot(other.rotation) < 0.0 { -other.rotation } else { other.rotation };
+        Self {
+            rotation: self.rotation.slerp(same_side, share),
+            translation: self.translation.lerp(other.translation, share),
+        }
+    }
+
     /// Products of many rotations lose unit length; this restores it.
     pub fn renormalized(&self) -> Self {
         Self {

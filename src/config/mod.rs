@@ -14,7 +14,7 @@ use serde_json::Value;
 use crate::config::range::{Range, ranges_of_comments};
 
 /// The shipped `launch/params.yaml`.
-pub const PARAMS_YAML: &str = include_str!("../launch/params.yaml");
+pub const PARAMS_YAML: &str = include_str!("../../launch/params.yaml");
 
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {

@@ -37,7 +37,7 @@ pub fn run(
     let (model, scale) = model(&job.params)?;
     let n_frames = job.source.len_hint().filter(|n| *n > 0);
     let map = SplatMap::new(job.params.map.clone(), job.params.seed, scale, engine(job.params.backend)?);
-    let mut stages = Stages {
+    let stages = Stages {
         map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
         select: SelectStage::new(&job.params),
         geometry: GeometryStage::new(model),

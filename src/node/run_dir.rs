@@ -19,7 +19,7 @@ use crate::eval::comparisons::Comparison;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib};
 use crate::eval::trajectory::{TimedPose, write_tum};
-use crate::eval::{image_metrics, trajectory};
+use crate::eval::image_metrics;
 use crate::export::ply;
 use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::layout::map_sha256;
@@ -108,8 +108,8 @@ fn write(
     let checkpoint =
         Checkpoint { snapshot: (**snapshot).clone(), seed: report.seed, steps: outcome.map.n_steps() };
     let results: [anyhow::Result<()>; 6] = [
-        write_tum(&out.join("keyframes.tum"), &keyframes).map_err(Into::into),
-        write_tum(&out.join("trajectory.tum"), &frames).map_err(Into::into),
+        write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
+        write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
         ply::write(&snapshot.splats, &out.join("map.ply")).map_err(Into::into),
         checkpoint::write(&checkpoint, &out.join("map.splatmap")).map_err(Into::into),
         report.write(&out.join("report.json")).map_err(Into::into),
@@ -212,7 +212,7 @@ fn interpolate(keyframes: &[TimedPose], stamps: &[Stamp]) -> Vec<TimedPose> {
         }
         let last = &keyframes[after.checked_sub(1)?];
         let share = stamp.secs_since(last.stamp) / next.stamp.secs_since(last.stamp);
-        Some(trajectory::between(&last.pose, &next.pose, share))
+        Some(last.pose.between(&next.pose, share))
     };
     stamps.iter().filter_map(|stamp| Some(TimedPose { stamp: *stamp, pose: pose_at(*stamp)? })).collect()
 }

@@ -200,6 +200,10 @@ impl Engine for CpuEngine {
         view.adam = PoseAdam::default();
     }
 
+    fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
+        self.views[view_ix].view.depth = depth;
+    }
+
     fn step(&mut self, view_ix: usize, settings: &StepSettings) {
         let view = &mut self.views[view_ix];
         let value = self.pass.differentiate(&self.splats, &view.view, settings);
