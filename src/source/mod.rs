@@ -8,6 +8,9 @@ pub mod images;
 pub mod intake;
 pub mod mcap;
 pub mod rectify;
+pub mod synthetic;
+
+use std::path::PathBuf;
 
 mod bag;
 mod survey;

@@ -15,3 +15,4 @@ mod scenes;
 mod sfm;
 mod sfm_measure;
 mod shaders;
+mod synthetic;
