@@ -12,7 +12,7 @@ use crate::export::ply;
 use crate::map::checkpoint;
 use crate::node;
 use crate::source::synthetic::record::write_recording;
-use crate::source::synthetic::settings::SynthSettings;
+use crate::source::synthetic::SynthSettings;
 use crate::splat::Splats;
 
 pub(super) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {

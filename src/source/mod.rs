@@ -10,8 +10,6 @@ pub mod mcap;
 pub mod rectify;
 pub mod synthetic;
 
-use std::path::PathBuf;
-
 mod bag;
 mod survey;
 mod truth;
@@ -73,7 +71,7 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
     match uri.split_once(':') {
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params),
-        Some(("synthetic", scene)) => open_synthetic(uri, scene, params, seed),
+        Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
         Some(("v4l2" | "webcam", _)) => {
             not_in_build("record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH")
         }
@@ -92,8 +90,8 @@ fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, So
     Ok(Box::new(images::ImagesSource::open(path, params)?))
 }
 
-fn open_synthetic(uri: &str, _scene: &str, _params: &SourceParams, _seed: u64) -> Result<Box<dyn Source>, SourceError> {
-    Err(SourceError::Uri { uri: uri.to_owned() })
+fn open_synthetic(scene: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(synthetic::SyntheticSource::open(scene, params, seed)?))
 }
 
 /// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.

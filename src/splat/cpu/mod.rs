@@ -24,7 +24,10 @@ use project_backward::{Forward, SplatGradients};
 use raster::Raster;
 use raster_backward::InstanceGradients;
 
+use std::sync::Arc;
+
 use crate::camera::Intrinsics;
+use crate::frame::DepthMap;
 use crate::pose::Rigid;
 use crate::splat::{Engine, Rendering, Splats, StepSettings, StepStats, TrainingView};
 
