@@ -4,6 +4,7 @@
 //! that no placed one shares enough with may start a component of their own, which is merged when a link turns up.
 
 mod adjusting;
+mod densify;
 mod landmarks;
 mod links;
 mod merging;
@@ -17,6 +18,7 @@ use std::sync::Arc;
 pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
+use self::densify::Densifier;
 use self::links::{link_alike, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
@@ -25,9 +27,9 @@ use self::scene::{NONE, Scene, Shot};
 use self::starting::{Start, start};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, SfmParams};
-use crate::frame::{Batch, DepthMap, Keyframe};
+use crate::frame::{Batch, Keyframe};
 use crate::geometry::features::{features, working_picture, working_size};
-use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, View};
+use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
@@ -49,7 +51,7 @@ pub(crate) struct Limits {
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
-    mvs: MvsParams,
+    densifier: Densifier,
     seed: u64,
     scene: Scene,
     told: Told,
@@ -61,7 +63,7 @@ impl Sfm {
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
         Self {
             sfm: sfm.clone(),
-            mvs: mvs.clone(),
+            densifier: Densifier::new(mvs),
             seed,
             scene: Scene::default(),
             told: Told::default(),
@@ -189,22 +191,13 @@ impl Sfm {
         }
     }
 
-    fn densify(&self, sparse: SparseBatch) -> GeometryBatch {
-        let views = sparse.views.into_iter().map(|view| View {
-            keyframe_id: view.keyframe_id,
-            component: view.component,
-            intrinsics: view.intrinsics,
-            batch_from_cam: view.batch_from_cam,
-            depth: self.depth(&view),
-            health: view.health,
-        });
-        GeometryBatch { batch_id: sparse.batch_id, views: views.collect(), revised: sparse.revised, note: sparse.note }
-    }
-
-    fn depth(&self, view: &SparseView) -> DepthMap {
-        let (w, h) = working_size(view.intrinsics.width_px, view.intrinsics.height_px, self.mvs.max_side);
-        let n = w as usize * h as usize;
-        DepthMap { width_px: w, height_px: h, depth: vec![0.0; n], confidence: vec![0.0; n] }
+    fn densify(&mut self, sparse: SparseBatch) -> GeometryBatch {
+        let shots = &self.scene.shots;
+        let image_of = |id: u32| {
+            let shot = shots.iter().rev().find(|shot| shot.keyframe.id == id)?;
+            Some(Arc::clone(&shot.keyframe.frame.image))
+        };
+        self.densifier.densify(sparse, &image_of)
     }
 }
 
