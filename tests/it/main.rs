@@ -2,5 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod eval;
+mod html;
+mod render;
 mod report;
 mod scenes;
+mod trajectory;
