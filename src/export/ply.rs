@@ -186,7 +186,7 @@ fn parse_header(lines: &[String]) -> Result<Table, String> {
             ["format", "binary_little_endian", "1.0"] => format_is_known = true,
             ["format", ..] => return Err(format!("{line:?}, expected binary_little_endian 1.0")),
             ["element", "vertex", count] if table.is_none() => {
-                let n_vertices = count.parse().map_err(|_| format!("{line:?} counts nothing"))?;
+                let n_vertices = count.parse().map_err(|e| format!("{line:?} counts nothing: {e}"))?;
                 table = Some(Table { n_vertices, properties: Vec::new() });
             }
             // Whatever stands behind the vertices is no splat.

@@ -16,7 +16,7 @@ pub mod zenoh;
 #[derive(Debug, thiserror::Error)]
 pub enum PublishError {
     #[error("parameter publish.{name} = {found:?} is of no use, expected {expected}")]
-    Param { name: &'static str, found: String, expected: &'static str },
+    Param { name: &'static str, found: String, expected: String },
     #[error("parameter publish.zenoh_config: {reason}: {}", path.display())]
     Config { reason: String, path: PathBuf },
     #[error("cannot open zenoh on {endpoints}: {reason}; check publish.zenoh_listen and publish.zenoh_connect")]

@@ -195,7 +195,7 @@ impl Names {
             return Err(PublishError::Param {
                 name: "namespace",
                 found: params.namespace.clone(),
-                expected: "letters, digits and underscores, parts joined by /",
+                expected: "letters, digits and underscores, parts joined by /".to_owned(),
             });
         }
         Ok(Self { domain_id: params.domain_id, namespace })
@@ -358,10 +358,10 @@ fn config_from_params(params: &PublishParams, listen: &str) -> Result<Config, Pu
         ),
     ];
     for (name, value, key, json) in settings {
-        config.insert_json5(key, &json).map_err(|_| PublishError::Param {
+        config.insert_json5(key, &json).map_err(|e| PublishError::Param {
             name,
             found: value.clone(),
-            expected: "an endpoint such as tcp/127.0.0.1:7447, or nothing",
+            expected: format!("an endpoint such as tcp/127.0.0.1:7447, or nothing ({e})"),
         })?;
     }
     Ok(config)

@@ -251,6 +251,9 @@ fn type_hashes_are_those_of_ros_2() {
 
 #[cfg(feature = "zenoh")]
 mod over_zenoh {
+    use std::io::{Read, Write};
+    use std::net::{TcpListener, TcpStream};
+    use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::Duration;
 
     use splat_mapper::clock::Stopwatch;
@@ -306,7 +309,7 @@ mod over_zenoh {
     }
 
     fn free_endpoint() -> String {
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         format!("tcp/{}", listener.local_addr().unwrap())
     }
 
@@ -389,12 +392,100 @@ mod over_zenoh {
         publisher.close().unwrap();
     }
 
+    /// A wire between a client and `endpoint` that can be stalled: bytes towards the client then stay where they are.
+    struct Wire {
+        endpoint: String,
+        stalled: Arc<AtomicBool>,
+    }
+
+    impl Wire {
+        fn new(endpoint: &str) -> Self {
+            let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+            let wire =
+                Self { endpoint: format!("tcp/{}", listener.local_addr().unwrap()), stalled: Arc::default() };
+            let (address, stalled) = (endpoint.strip_prefix("tcp/").unwrap().to_owned(), Arc::clone(&wire.stalled));
+            let named = |name: &str| std::thread::Builder::new().name(name.to_owned());
+            let carry = move || {
+                let (near, _) = listener.accept().unwrap();
+                let far = TcpStream::connect(address).unwrap();
+                let (mut near_in, mut far_out) = (near.try_clone().unwrap(), far.try_clone().unwrap());
+                named("wire-out").spawn(move || std::io::copy(&mut near_in, &mut far_out)).unwrap();
+                let (mut far, mut near, mut bytes) = (far, near, [0; 4096]);
+                while let Ok(n @ 1..) = far.read(&mut bytes) {
+                    near.write_all(&bytes[..n]).unwrap();
+                    while stalled.load(Ordering::Relaxed) {
+                        std::thread::park_timeout(Duration::from_millis(20));
+                    }
+                }
+            };
+            named("wire-in").spawn(carry).unwrap();
+            wire
+        }
+    }
+
     #[test]
-    fn close_is_quick_without_peers_and_with_one_that_reads_nothing() {
+    fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
+        let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+        let endpoint = publisher.endpoints().remove(0);
+        // 18 MB each: more than all buffers on the way hold.
+        let snapshot = |revision| Arc::new(random_snapshot(60_000, 3, 3, revision));
+        publisher.publish(&snapshot(1)).unwrap();
+        let wire = Wire::new(&endpoint);
+        let stuck = client("", &wire.endpoint);
+        let _stuck_live = stuck.declare_subscriber("0/splat_mapper/**").wait().unwrap();
+        ask(&stuck, "0/splat_mapper/**").expect("no snapshot before the stall");
+        let session = client("", &endpoint);
+        let live = session.declare_subscriber("0/splat_mapper/**").wait().unwrap();
+        ask(&session, "0/splat_mapper/**").expect("no snapshot for the healthy one");
+        wire.stalled.store(true, Ordering::Relaxed);
+
+        let started = Stopwatch::start();
+        let last = snapshot(4);
+        let received = std::thread::scope(|scope| {
+            let receiver = scope.spawn(|| {
+                let mut assembler = Assembler::new(MAX_BYTES);
+                std::iter::repeat_with(|| live.recv_timeout(PATIENCE).unwrap().expect("silence"))
+                    .filter_map(|sample| take(&mut assembler, &sample))
+                    .find(|snapshot| snapshot.revision == 4)
+            });
+            [snapshot(2), snapshot(3), Arc::clone(&last)].iter().for_each(|s| publisher.publish(s).unwrap());
+            receiver.join().unwrap()
+        });
+        assert_eq!(received.as_ref(), Some(&*last));
+        assert!(started.secs() > 1.5, "{} s: nothing stalled, so nothing was tested", started.secs());
+        let closing = Stopwatch::start();
+        publisher.close().unwrap();
+        assert!(closing.secs() < 2.0, "{} s", closing.secs());
+        wire.stalled.store(false, Ordering::Relaxed);
+    }
+
+    #[test]
+    fn close_without_peers_is_quick() {
         let publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
         let started = Stopwatch::start();
         publisher.close().unwrap();
         assert!(started.secs() < 2.0, "{} s", started.secs());
+    }
+
+    #[test]
+    fn a_zenoh_configuration_file_stands_for_the_endpoints() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("zenoh.json5");
+        let endpoint = free_endpoint();
+        let text = format!("{{ listen: {{ endpoints: [{endpoint:?}] }}, scouting: {{ multicast: {{ enabled: false }} }} }}");
+        std::fs::write(&path, text).unwrap();
+        let mut params = params("nonsense that nobody reads");
+        params.zenoh_config = path.display().to_string();
+        let mut publisher = ZenohPublisher::open(&params).unwrap();
+        assert_eq!(publisher.endpoints(), std::slice::from_ref(&endpoint));
+        let snapshot = Arc::new(random_snapshot(20, 1, 0, 1));
+        publisher.publish(&snapshot).unwrap();
+        assert_eq!(ask(&client("", &endpoint), "0/splat_mapper/**"), Some((*snapshot).clone()));
+        publisher.close().unwrap();
+
+        std::fs::write(&path, "{ listen: ").unwrap();
+        let fault = ZenohPublisher::open(&params).unwrap_err().to_string();
+        assert!(fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"), "{fault}");
     }
 
     #[test]
@@ -411,7 +502,7 @@ mod over_zenoh {
         bad.zenoh_config = "/nowhere/zenoh.json5".to_owned();
         assert!(message(bad).contains("publish.zenoh_config"));
         // A port that is taken.
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let taken = format!("tcp/{}", listener.local_addr().unwrap());
         let fault = ZenohPublisher::open(&params(&taken)).unwrap_err();
         assert!(matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken), "{fault}");
