@@ -168,7 +168,10 @@ fn read_header(file: &mut impl BufRead) -> io::Result<Result<(Vec<String>, u64),
         // Comments may be in any encoding; what matters is plain ASCII.
         let text = String::from_utf8_lossy(&line).trim_end().to_owned();
         if lines.is_empty() && text != "ply" {
-            return Ok(Err(format!("it begins with {:?}, expected \"ply\"", text.chars().take(16).collect::<String>())));
+            return Ok(Err(format!(
+                "it begins with {:?}, expected \"ply\"",
+                text.chars().take(16).collect::<String>()
+            )));
         }
         if text == "end_header" {
             return Ok(Ok((lines, n_bytes)));

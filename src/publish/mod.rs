@@ -27,6 +27,6 @@ pub enum PublishError {
     Send { key: String, reason: String },
     #[error(transparent)]
     Encode(#[from] CdrError),
-    #[error("zenoh did not close within {waited_secs} s; its threads are left behind")]
+    #[error("zenoh did not close within {waited_secs} s, most likely over a stalled peer; its threads are left behind")]
     Close { waited_secs: f64 },
 }

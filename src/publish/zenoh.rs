@@ -26,7 +26,7 @@ use crate::ros::{Message, PoseStamped};
 
 /// A peer that takes in nothing for so long while we wait is cut off; it may connect again.
 const MAX_BLOCKED: Duration = Duration::from_secs(2);
-/// `close` waits no longer.
+/// `close` waits no longer. zenoh itself lingers ten seconds over bytes that a stalled peer never takes.
 const MAX_CLOSING: Duration = Duration::from_secs(2);
 /// Questions of late joiners that may wait; more are dropped, and their askers see an empty answer.
 const MAX_QUESTIONS: usize = 32;
@@ -141,7 +141,11 @@ impl ZenohPublisher {
         let stamp_nanos = snapshot.stamp.nanos;
         let [pose, keyframes, splats, manifest] = &mut self.topics;
         Ok([
-            messages.pose().map(|message| pose.outgoing(&message, stamp_nanos)).into_iter().collect::<Result<_, _>>()?,
+            messages
+                .pose()
+                .map(|message| pose.outgoing(&message, stamp_nanos))
+                .into_iter()
+                .collect::<Result<_, _>>()?,
             messages.keyframes().map(|message| keyframes.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
             messages.chunks().map(|message| splats.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
             vec![manifest.outgoing(&messages.manifest(), stamp_nanos)?],

@@ -2,5 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod formats;
+#[cfg(feature = "zenoh")]
+mod over_zenoh;
 mod publish;
 mod scenes;
