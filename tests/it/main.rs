@@ -8,6 +8,8 @@ mod gradients;
 mod hostile_splats;
 mod html;
 mod layers;
+#[cfg(feature = "zenoh")]
+mod over_zenoh;
 mod publish;
 mod reference;
 mod render;
