@@ -1,4 +1,5 @@
 //! All integration tests in one binary: one link of the dependencies.
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+mod engine;
 mod scenes;

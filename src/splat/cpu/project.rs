@@ -25,6 +25,8 @@ pub(crate) const CHUNK: usize = 256;
 const MAX_EXTENT_SIGMAS: f64 = 3.33;
 /// Squares of pixel coordinates beyond this lose their meaning in f32.
 const MAX_CENTER_PX: f64 = 1e9;
+/// A colour beyond this is a broken splat; its square would take SSIM, and with it the whole picture, to infinity.
+const MAX_COLOR: f32 = 1e4;
 /// Keeps the exact extents on the safe side of f32 rounding in `raster`.
 const EXTENT_SLACK_PX: f64 = 0.01;
 
@@ -159,7 +161,7 @@ pub(crate) fn shape_direction(mean: [f32; 3], camera: &Camera) -> DVec3 {
     (vec3(mean) - camera.center_in_map).normalize_or_zero()
 }
 
-/// `None` when a coefficient is not finite.
+/// `None` when it is NaN or absurd.
 fn color(splats: &Splats, ix: usize, dir: DVec3, sh_degree: u8) -> Option<[f32; 3]> {
     let degree = sh_degree.min(splats.sh_degree);
     let basis = sh::basis(dir, degree);
@@ -172,7 +174,7 @@ fn color(splats: &Splats, ix: usize, dir: DVec3, sh_degree: u8) -> Option<[f32; 
         }
     }
     let color = color.map(|c| c as f32);
-    color.iter().all(|c| c.is_finite()).then(|| color.map(|c| c.max(0.0)))
+    color.iter().all(|c| c.abs() < MAX_COLOR).then(|| color.map(|c| c.max(0.0)))
 }
 
 impl Camera {
