@@ -16,8 +16,8 @@ pub(crate) const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Vectors in a row of a tile, and in a tile.
 pub(crate) const ROW_VECTORS: usize = TILE_PX / LANES;
 pub(crate) const TILE_VECTORS: usize = TILE_PX * ROW_VECTORS;
-/// Splats between two looks at whether all pixels of the tile have stopped.
-const STOP_CHECK_EVERY: usize = 16;
+/// Splats of a tile that are fetched together; between batches, a look at whether all pixels have stopped.
+pub(crate) const BATCH: usize = 16;
 /// Zeros left and right of each row of a plane: SSIM's window reaches 5 pixels out.
 pub const PLANE_MARGIN: usize = 8;
 
@@ -56,7 +56,7 @@ pub(crate) struct TileArea {
 }
 
 /// A splat as the loops of one tile want it.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct TileSplat {
     pub(crate) opacity: f32,
     /// From the centre of the tile's first pixel to the splat's centre.
@@ -66,8 +66,11 @@ pub(crate) struct TileSplat {
     pub(crate) half_a: f32,
     pub(crate) b: f32,
     pub(crate) half_c: f32,
-    pub(crate) rows: std::ops::Range<usize>,
-    pub(crate) vectors: std::ops::Range<usize>,
+    pub(crate) color: [f32; 3],
+    pub(crate) depth: f32,
+    /// Half-open.
+    rows: [u8; 2],
+    vectors: [u8; 2],
 }
 
 /// Composites all tiles.
@@ -93,36 +96,17 @@ fn raster_tile(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, ou
 #[inline(always)]
 fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, out: &mut TilePixels) {
     out.clear(area);
-    out.n_used = instances.len() as u32;
-    for (k, &ix) in instances.iter().enumerate() {
-        if k % STOP_CHECK_EVERY == 0 && all_stopped(&out.transmittance) {
-            out.n_used = k as u32;
+    out.n_used = 0;
+    let mut batch = [TileSplat::NONE; BATCH];
+    for instances in instances.chunks(BATCH) {
+        if all_stopped(&out.transmittance) {
             break;
         }
-        let splat = &visible[ix as usize];
-        let local = TileSplat::new(splat, area);
-        let dx = local.dx();
-        for row in local.rows.clone() {
-            let dy = local.y - row as f32;
-            for half in local.vectors.clone() {
-                let v = row * ROW_VECTORS + half;
-                let mut w = [0.0; LANES];
-                let mut t = out.transmittance[v];
-                for i in 0..LANES {
-                    let alpha = local.alpha::<FMA>(dx[half][i], dy).0;
-                    let next = t[i] * (1.0 - alpha);
-                    let is_seen = alpha >= MIN_ALPHA;
-                    let is_over = next <= MIN_TRANSMITTANCE;
-                    w[i] = if is_seen && !is_over { alpha * t[i] } else { 0.0 };
-                    let stopped = if is_over { -t[i].abs() } else { next };
-                    t[i] = if is_seen { stopped } else { t[i] };
-                }
-                out.transmittance[v] = t;
-                for i in 0..LANES {
-                    out.rgb[0][v][i] = madd::<FMA>(w[i], splat.color[0], out.rgb[0][v][i]);
-                    out.rgb[1][v][i] = madd::<FMA>(w[i], splat.color[1], out.rgb[1][v][i]);
-                    out.rgb[2][v][i] = madd::<FMA>(w[i], splat.color[2], out.rgb[2][v][i]);
-                    out.depth_sum[v][i] = madd::<FMA>(w[i], splat.depth, out.depth_sum[v][i]);
+        out.n_used += instances.len() as u32;
+        for splat in load_batch(visible, instances, area, &mut batch) {
+            for row in splat.rows() {
+                for half in splat.vectors() {
+                    blend::<FMA>(splat, row, half, out);
                 }
             }
         }
@@ -130,6 +114,48 @@ fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], are
     for t in out.transmittance.as_flattened_mut() {
         *t = t.abs();
     }
+}
+
+/// One vector of pixels. Everything goes through locals: LLVM makes masked stores of selects into memory, which
+/// stall the loads behind them.
+#[inline(always)]
+fn blend<const FMA: bool>(splat: &TileSplat, row: usize, half: usize, out: &mut TilePixels) {
+    let v = row * ROW_VECTORS + half;
+    let (x, dy) = (splat.x - (half * LANES) as f32, splat.y - row as f32);
+    let [red, green, blue] = splat.color;
+    let mut t = out.transmittance[v];
+    let [mut r, mut g, mut b] = out.rgb.each_ref().map(|channel| channel[v]);
+    let mut z = out.depth_sum[v];
+    for i in 0..LANES {
+        let (alpha, _) = splat.alpha::<FMA>(x - i as f32, dy);
+        let next = t[i] * (1.0 - alpha);
+        let is_over = next <= MIN_TRANSMITTANCE;
+        let weight = if is_over { 0.0 } else { alpha * t[i] };
+        r[i] = madd::<FMA>(weight, red, r[i]);
+        g[i] = madd::<FMA>(weight, green, g[i]);
+        b[i] = madd::<FMA>(weight, blue, b[i]);
+        z[i] = madd::<FMA>(weight, splat.depth, z[i]);
+        t[i] = if is_over { -t[i].abs() } else { next };
+    }
+    out.transmittance[v] = t;
+    for (channel, value) in out.rgb.iter_mut().zip([r, g, b]) {
+        channel[v] = value;
+    }
+    out.depth_sum[v] = z;
+}
+
+/// Brings the next splats of a tile from all over memory into one place; the loads overlap.
+#[inline(always)]
+pub(crate) fn load_batch<'a>(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    batch: &'a mut [TileSplat; BATCH],
+) -> &'a [TileSplat] {
+    for (slot, &ix) in batch.iter_mut().zip(instances) {
+        *slot = TileSplat::new(&visible[ix as usize], area);
+    }
+    &batch[..instances.len()]
 }
 
 /// Pixels off the picture count as stopped from the start.
@@ -206,19 +232,31 @@ impl TilePixels {
 }
 
 impl TileSplat {
+    pub(crate) const NONE: Self = Self {
+        opacity: 0.0,
+        x: 0.0,
+        y: 0.0,
+        half_a: 0.0,
+        b: 0.0,
+        half_c: 0.0,
+        color: [0.0; 3],
+        depth: 0.0,
+        rows: [0; 2],
+        vectors: [0; 2],
+    };
+
     #[inline(always)]
-    pub(crate) fn new(splat: &ProjectedSplat, area: TileArea) -> Self {
+    fn new(splat: &ProjectedSplat, area: TileArea) -> Self {
         const LOG2_E: f32 = std::f32::consts::LOG2_E;
         let x = splat.center[0] - (area.x as f32 + 0.5);
         let y = splat.center[1] - (area.y as f32 + 0.5);
         let [a, b, c] = splat.conic;
         let [half_x, half_y] = splat.half_px;
-        // Pixel k of a row is reached when |k - x| <= half_x; `as` cuts off and takes negative to 0.
-        let first_row = ((y - half_y + 0.99) as usize).min(area.n_rows);
-        let end_row = ((y + half_y + 1.0) as usize).clamp(first_row, area.n_rows);
-        let first_column = (x - half_x + 0.99) as usize;
-        let end_column = ((x + half_x + 1.0) as usize).min(area.n_columns);
-        let first_vector = (first_column / LANES).min(ROW_VECTORS);
+        // Pixel k of a row is reached when |k - x| <= half_x; `as` cuts off, and takes negative to 0.
+        let first_row = (y - half_y + 0.99) as u8;
+        let end_row = ((y + half_y + 1.0) as u8).min(area.n_rows as u8);
+        let first_column = (x - half_x + 0.99) as u8;
+        let end_column = ((x + half_x + 1.0) as u8).min(area.n_columns as u8);
         Self {
             opacity: splat.opacity,
             x,
@@ -226,32 +264,37 @@ impl TileSplat {
             half_a: -0.5 * LOG2_E * a,
             b: -LOG2_E * b,
             half_c: -0.5 * LOG2_E * c,
-            rows: first_row..end_row,
-            vectors: first_vector..end_column.div_ceil(LANES).max(first_vector),
+            color: splat.color,
+            depth: splat.depth,
+            rows: [first_row, end_row],
+            vectors: [first_column / LANES as u8, end_column.div_ceil(LANES as u8)],
         }
     }
 
-    /// `dx` of each pixel of a row, the same in all rows.
+    /// Rows of the tile that the splat's box reaches.
     #[inline(always)]
-    pub(crate) fn dx(&self) -> [Lane; ROW_VECTORS] {
-        let mut dx = [[0.0; LANES]; ROW_VECTORS];
-        for (k, dx) in dx.as_flattened_mut().iter_mut().enumerate() {
-            *dx = self.x - k as f32;
-        }
-        dx
+    pub(crate) fn rows(&self) -> std::ops::Range<usize> {
+        usize::from(self.rows[0])..usize::from(self.rows[1])
     }
 
-    /// Alpha of a pixel, and whether it is below the clamp. `raster_backward` must come to the same bits.
+    /// Vectors of a row that the box reaches.
+    #[inline(always)]
+    pub(crate) fn vectors(&self) -> std::ops::Range<usize> {
+        usize::from(self.vectors[0])..usize::from(self.vectors[1])
+    }
+
+    /// Alpha of a pixel, 0 where it is too faint to count, and whether it is below the upper clamp.
+    /// `raster_backward` must come to the same bits.
     #[inline(always)]
     pub(crate) fn alpha<const FMA: bool>(&self, dx: f32, dy: f32) -> (f32, bool) {
         let along_x = madd::<FMA>(self.half_a, dx, self.b * dy);
         let exponent = madd::<FMA>(along_x, dx, self.half_c * dy * dy);
         let alpha = self.opacity * exp2::<FMA>(exponent);
+        // Rounding may take the exponent of a needle above 0, where the Gaussian has no value; NaN is out too.
+        let is_seen = (alpha >= MIN_ALPHA) & (exponent <= 0.0);
         let is_free = alpha <= MAX_ALPHA;
-        let alpha = if is_free { alpha } else { MAX_ALPHA };
-        // Rounding may take the exponent of a needle above 0, where the Gaussian has no value; NaN goes here too.
-        let alpha = if exponent <= 0.0 { alpha } else { 0.0 };
-        (alpha, is_free)
+        let clamped = if is_free { alpha } else { MAX_ALPHA };
+        (if is_seen { clamped } else { 0.0 }, is_free)
     }
 }
 

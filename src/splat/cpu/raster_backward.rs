@@ -8,9 +8,9 @@ use multiversion::multiversion;
 use super::bin::Tiles;
 use super::lanes::{LANES, Lane, madd};
 use super::loss::PixelGradients;
-use super::project::{MIN_ALPHA, ProjectedSplat, TILE_PX};
+use super::project::{ProjectedSplat, TILE_PX};
 use super::raster::{
-    MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea, TilePixels, TileSplat, start_transmittance,
+    BATCH, MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea, TilePixels, TileSplat, load_batch, start_transmittance,
 };
 
 /// d loss / d one instance.
@@ -118,51 +118,49 @@ fn walk<const FMA: bool>(
     pixels: &mut TileGradients,
     out: &mut [InstanceGradient],
 ) {
-    for (&ix, out) in instances.iter().zip(out) {
-        let splat = &visible[ix as usize];
-        let local = TileSplat::new(splat, area);
-        let dx = local.dx();
-        let mut sums = ColumnSums::default();
-        for row in local.rows.clone() {
-            let dy = local.y - row as f32;
-            for half in local.vectors.clone() {
-                add_pixels::<FMA>(splat, &local, &dx[half], dy, (row, half), pixels, &mut sums);
+    let mut batch = [TileSplat::NONE; BATCH];
+    for (instances, out) in instances.chunks(BATCH).zip(out.chunks_mut(BATCH)) {
+        let splats = load_batch(visible, &instances[..out.len()], area, &mut batch);
+        for ((splat, out), &ix) in splats.iter().zip(out).zip(instances) {
+            let mut sums = ColumnSums::default();
+            for row in splat.rows() {
+                for half in splat.vectors() {
+                    add_pixels::<FMA>(splat, row, half, pixels, &mut sums);
+                }
             }
+            *out = sums.gradient(splat, visible[ix as usize].conic);
         }
-        *out = sums.gradient(splat, &dx);
     }
 }
 
-/// One vector of pixels.
+/// One vector of pixels; locals for the reason given at `raster`'s.
 #[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "inlined: the body of two loops")]
 fn add_pixels<const FMA: bool>(
-    splat: &ProjectedSplat,
-    local: &TileSplat,
-    dx: &Lane,
-    dy: f32,
-    (row, half): (usize, usize),
+    splat: &TileSplat,
+    row: usize,
+    half: usize,
     pixels: &mut TileGradients,
     sums: &mut ColumnSums,
 ) {
     let p = row * ROW_VECTORS + half;
+    let (x, dy) = (splat.x - (half * LANES) as f32, splat.y - row as f32);
+    let [red, green, blue] = splat.color;
     let (mut t, mut behind) = (pixels.transmittance[p], pixels.behind[p]);
     let [v_r, v_g, v_b, v_z] = pixels.v.each_ref().map(|v| v[p]);
     let [mut m0, mut m1, mut m2] = sums.moments.each_ref().map(|m| m[half]);
     let [mut sum_r, mut sum_g, mut sum_b, mut sum_z] = sums.channels.each_ref().map(|c| c[half]);
     for i in 0..LANES {
-        let (alpha, is_free) = local.alpha::<FMA>(dx[i], dy);
+        let (alpha, is_free) = splat.alpha::<FMA>(x - i as f32, dy);
         let next = t[i] * (1.0 - alpha);
-        let is_seen = alpha >= MIN_ALPHA;
         let is_over = next <= MIN_TRANSMITTANCE;
-        let is_added = is_seen && !is_over;
-        let weight = if is_added { alpha * t[i] } else { 0.0 };
-        let seen = madd::<FMA>(splat.color[0], v_r[i], splat.color[1] * v_g[i]);
-        let seen = madd::<FMA>(splat.color[2], v_b[i], seen);
+        let weight = if is_over { 0.0 } else { alpha * t[i] };
+        let seen = madd::<FMA>(red, v_r[i], green * v_g[i]);
+        let seen = madd::<FMA>(blue, v_b[i], seen);
         let seen = madd::<FMA>(splat.depth, v_z[i], seen);
         behind[i] = madd::<FMA>(-weight, seen, behind[i]);
         let v_alpha = madd::<FMA>(t[i], seen, -behind[i] / (1.0 - alpha));
-        let v_sigma = if is_added && is_free { -alpha * v_alpha } else { 0.0 };
+        // Alpha 0 stands for a pixel that the splat does not reach.
+        let v_sigma = if is_free & !is_over { -alpha * v_alpha } else { 0.0 };
         m0[i] += v_sigma;
         m1[i] = madd::<FMA>(v_sigma, dy, m1[i]);
         m2[i] = madd::<FMA>(v_sigma, dy * dy, m2[i]);
@@ -170,8 +168,7 @@ fn add_pixels<const FMA: bool>(
         sum_g[i] = madd::<FMA>(weight, v_g[i], sum_g[i]);
         sum_b[i] = madd::<FMA>(weight, v_b[i], sum_b[i]);
         sum_z[i] = madd::<FMA>(weight, v_z[i], sum_z[i]);
-        let stopped = if is_over { -t[i].abs() } else { next };
-        t[i] = if is_seen { stopped } else { t[i] };
+        t[i] = if is_over { -t[i].abs() } else { next };
     }
     pixels.transmittance[p] = t;
     pixels.behind[p] = behind;
@@ -185,19 +182,18 @@ fn add_pixels<const FMA: bool>(
 
 impl ColumnSums {
     #[inline(always)]
-    fn gradient(&self, splat: &ProjectedSplat, dx: &[Lane; ROW_VECTORS]) -> InstanceGradient {
-        let dx = dx.as_flattened();
+    fn gradient(&self, splat: &TileSplat, [a, b, c]: [f32; 3]) -> InstanceGradient {
         let [m0, m1, m2] = self.moments.each_ref().map(|m| m.as_flattened());
         let mut moment_x = [0.0; TILE_PX];
         let mut moment_xx = [0.0; TILE_PX];
         let mut moment_xy = [0.0; TILE_PX];
         for i in 0..TILE_PX {
-            moment_x[i] = m0[i] * dx[i];
-            moment_xx[i] = m0[i] * dx[i] * dx[i];
-            moment_xy[i] = m1[i] * dx[i];
+            let dx = splat.x - i as f32;
+            moment_x[i] = m0[i] * dx;
+            moment_xx[i] = m0[i] * dx * dx;
+            moment_xy[i] = m1[i] * dx;
         }
         let (sum, x, y) = (total(m0), total(&moment_x), total(m1));
-        let [a, b, c] = splat.conic;
         let [red, green, blue, depth] = self.channels.each_ref().map(|c| total(c.as_flattened()));
         InstanceGradient {
             center: [a * x + b * y, b * x + c * y],
