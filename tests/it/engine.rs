@@ -30,7 +30,10 @@ fn steps_lower_the_loss() {
 #[test]
 fn one_and_two_threads_come_to_the_same_bits() {
     let run = |n_threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(n_threads)
+            .build()
+            .unwrap();
         pool.install(|| trained(20))
     };
     let (one, again, two) = (run(1), run(1), run(2));
@@ -62,12 +65,23 @@ fn retain_and_append_leave_the_optimiser_of_the_others_alone() {
     engine.append(&passengers);
     (0..3).for_each(|_| engine.step(0, &settings()));
     engine.retain(&(0..70).map(|ix| ix < 60).collect::<Vec<_>>());
-    assert!(engine.splats() == plain, "an update came out differently beside other splats");
+    assert!(
+        engine.splats() == plain,
+        "an update came out differently beside other splats"
+    );
 }
 
 #[test]
 fn hostile_splats_do_no_harm() {
-    let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38, -1e38, 1e-38, 0.0];
+    let bad = [
+        f32::NAN,
+        f32::INFINITY,
+        f32::NEG_INFINITY,
+        1e38,
+        -1e38,
+        1e-38,
+        0.0,
+    ];
     let mut splats = random_splats(50, 5);
     for &value in &bad {
         for slot in 0..12 {
@@ -94,18 +108,41 @@ fn hostile_splats_do_no_harm() {
     engine.add_view(photograph(&random_splats(50, 8), &side_pose()));
     (0..5).for_each(|_| engine.step(0, &settings()));
     let after = engine.splats();
-    assert!(after.means[..50].as_flattened().iter().all(|x| x.is_finite()), "bad splats infect good ones");
+    assert!(
+        after.means[..50]
+            .as_flattened()
+            .iter()
+            .all(|x| x.is_finite()),
+        "bad splats infect good ones"
+    );
     let loss = engine.take_stats().loss;
     assert!(loss.is_finite(), "{loss}");
     assert!(engine.poses()[0].is_finite());
-    let Rendering { rgb, alpha, depth, .. } = engine.render(&intrinsics(), &side_pose(), 3);
-    assert!(rgb.iter().chain(&alpha).chain(&depth).all(|x| x.is_finite()));
+    let Rendering {
+        rgb, alpha, depth, ..
+    } = engine.render(&intrinsics(), &side_pose(), 3);
+    assert!(
+        rgb.iter()
+            .chain(&alpha)
+            .chain(&depth)
+            .all(|x| x.is_finite())
+    );
 }
 
 #[test]
 fn tiny_pictures_and_empty_maps_render_black() {
-    let one_pixel = Intrinsics { width_px: 1, height_px: 1, cx: 0.5, cy: 0.5, ..intrinsics() };
-    let no_pixel = Intrinsics { width_px: 0, height_px: 0, ..intrinsics() };
+    let one_pixel = Intrinsics {
+        width_px: 1,
+        height_px: 1,
+        cx: 0.5,
+        cy: 0.5,
+        ..intrinsics()
+    };
+    let no_pixel = Intrinsics {
+        width_px: 0,
+        height_px: 0,
+        ..intrinsics()
+    };
     for (splats, n_lit) in [(Splats::default(), 0), (random_splats(300, 9), 1)] {
         let mut engine = CpuEngine::new();
         engine.append(&splats);
@@ -136,10 +173,16 @@ fn a_pose_finds_back_while_the_splats_are_frozen() {
     let splats = random_splats(300, 10);
     let truth = side_pose();
     let view = photograph(&splats, &truth);
-    let off = Rigid::exp(DVec3::new(0.03, -0.02, 0.02), DVec3::new(0.01, 0.02, -0.015)) * truth;
+    let off = Rigid::exp(
+        DVec3::new(0.03, -0.02, 0.02),
+        DVec3::new(0.01, 0.02, -0.015),
+    ) * truth;
     let mut engine = CpuEngine::new();
     engine.append(&splats);
-    engine.add_view(TrainingView { cam_from_map: off, ..view });
+    engine.add_view(TrainingView {
+        cam_from_map: off,
+        ..view
+    });
     for step in 0..300 {
         let rate = 2e-3 * 0.985_f32.powi(step);
         let only_pose = StepSettings {
@@ -152,9 +195,20 @@ fn a_pose_finds_back_while_the_splats_are_frozen() {
         engine.step(0, &only_pose);
     }
     let found = engine.poses()[0];
-    assert!(found.angle_to(&truth) < 0.1 * off.angle_to(&truth), "{} of {} rad", found.angle_to(&truth), off.angle_to(&truth));
-    let distance = |pose: &Rigid| (pose.inverse().translation - truth.inverse().translation).length();
-    assert!(distance(&found) < 0.1 * distance(&off), "{} of {}", distance(&found), distance(&off));
+    assert!(
+        found.angle_to(&truth) < 0.1 * off.angle_to(&truth),
+        "{} of {} rad",
+        found.angle_to(&truth),
+        off.angle_to(&truth)
+    );
+    let distance =
+        |pose: &Rigid| (pose.inverse().translation - truth.inverse().translation).length();
+    assert!(
+        distance(&found) < 0.1 * distance(&off),
+        "{} of {}",
+        distance(&found),
+        distance(&off)
+    );
     assert!(engine.splats() == splats, "frozen splats moved");
 }
 
@@ -165,7 +219,10 @@ fn a_view_that_sees_nothing_changes_nothing() {
     let away = Rigid::new(DQuat::from_rotation_y(std::f64::consts::PI), DVec3::ZERO);
     let mut engine = CpuEngine::new();
     engine.append(&splats);
-    engine.add_view(TrainingView { cam_from_map: away, ..view });
+    engine.add_view(TrainingView {
+        cam_from_map: away,
+        ..view
+    });
     engine.step(0, &settings());
     assert!(engine.splats() == splats);
     assert_eq!(engine.poses()[0], away);
@@ -173,8 +230,13 @@ fn a_view_that_sees_nothing_changes_nothing() {
 
 /// A splat ends where alpha is 1/255, not 0: moving that edge changes the loss, and differences see it while the
 /// gradient does not. So only most of a difference can agree, the most for parameters that move no edge.
-const ALIKE: [(&str, f64); 5] =
-    [("means", 0.995), ("log_scales", 0.98), ("quats", 0.99), ("opacity_logits", 0.99), ("sh", 0.9999)];
+const ALIKE: [(&str, f64); 5] = [
+    ("means", 0.995),
+    ("log_scales", 0.98),
+    ("quats", 0.99),
+    ("opacity_logits", 0.99),
+    ("sh", 0.9999),
+];
 
 #[test]
 fn gradients_agree_with_differences_of_the_loss() {
@@ -187,17 +249,30 @@ fn gradients_agree_with_differences_of_the_loss() {
         change(&mut splats);
         gradients(&splats, &view, &settings()).loss
     };
-    let check = |kind: usize, found: &[f32], step: f32, change: &dyn Fn(&mut Splats, usize, f32)| {
-        let expected = (0..found.len()).map(|k| {
-            let difference = loss(&|s| change(s, k, step)) - loss(&|s| change(s, k, -step));
-            difference / (2.0 * f64::from(step))
-        });
-        assert_alike(ALIKE[kind], &found.iter().map(|&g| f64::from(g)).collect::<Vec<_>>(), &expected.collect::<Vec<_>>());
-    };
-    check(0, g.means.as_flattened(), 2e-4, &|s, k, d| s.means.as_flattened_mut()[k] += d);
-    check(1, g.log_scales.as_flattened(), 2e-3, &|s, k, d| s.log_scales.as_flattened_mut()[k] += d);
-    check(2, g.quats.as_flattened(), 2e-3, &|s, k, d| s.quats.as_flattened_mut()[k] += d);
-    check(3, &g.opacity_logits, 5e-3, &|s, k, d| s.opacity_logits[k] += d);
+    let check =
+        |kind: usize, found: &[f32], step: f32, change: &dyn Fn(&mut Splats, usize, f32)| {
+            let expected = (0..found.len()).map(|k| {
+                let difference = loss(&|s| change(s, k, step)) - loss(&|s| change(s, k, -step));
+                difference / (2.0 * f64::from(step))
+            });
+            assert_alike(
+                ALIKE[kind],
+                &found.iter().map(|&g| f64::from(g)).collect::<Vec<_>>(),
+                &expected.collect::<Vec<_>>(),
+            );
+        };
+    check(0, g.means.as_flattened(), 2e-4, &|s, k, d| {
+        s.means.as_flattened_mut()[k] += d
+    });
+    check(1, g.log_scales.as_flattened(), 2e-3, &|s, k, d| {
+        s.log_scales.as_flattened_mut()[k] += d
+    });
+    check(2, g.quats.as_flattened(), 2e-3, &|s, k, d| {
+        s.quats.as_flattened_mut()[k] += d
+    });
+    check(3, &g.opacity_logits, 5e-3, &|s, k, d| {
+        s.opacity_logits[k] += d
+    });
     check(4, &g.sh[..480], 5e-3, &|s, k, d| s.sh[k] += d);
     let expected: [f64; 6] = std::array::from_fn(|axis| {
         let mut delta = [0.0; 6];
@@ -205,7 +280,10 @@ fn gradients_agree_with_differences_of_the_loss() {
         let moved = |sign: f64| {
             let d = delta.map(|d| sign * d);
             let step = Rigid::exp(DVec3::new(d[0], d[1], d[2]), DVec3::new(d[3], d[4], d[5]));
-            let view = TrainingView { cam_from_map: step * view.cam_from_map, ..view.clone() };
+            let view = TrainingView {
+                cam_from_map: step * view.cam_from_map,
+                ..view.clone()
+            };
             gradients(&splats, &view, &settings()).loss
         };
         (moved(1.0) - moved(-1.0)) / 2e-4
@@ -216,9 +294,16 @@ fn gradients_agree_with_differences_of_the_loss() {
 /// Cosine above the bound, and lengths within 5 %.
 fn assert_alike((name, min_cosine): (&str, f64), found: &[f64], expected: &[f64]) {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let (ff, fe, ee) = (dot(found, found), dot(found, expected), dot(expected, expected));
+    let (ff, fe, ee) = (
+        dot(found, found),
+        dot(found, expected),
+        dot(expected, expected),
+    );
     let (cosine, ratio) = (fe / (ff * ee).sqrt(), (ff / ee).sqrt());
-    assert!(cosine > min_cosine && (ratio - 1.0).abs() < 0.05, "{name}: cosine {cosine}, ratio {ratio}");
+    assert!(
+        cosine > min_cosine && (ratio - 1.0).abs() < 0.05,
+        "{name}: cosine {cosine}, ratio {ratio}"
+    );
 }
 
 fn trained(n_steps: usize) -> (Splats, Vec<Rigid>, [u64; 2]) {
@@ -228,7 +313,11 @@ fn trained(n_steps: usize) -> (Splats, Vec<Rigid>, [u64; 2]) {
     engine.add_view(photograph(&truth, &side_pose()));
     (0..n_steps).for_each(|_| engine.step(0, &settings()));
     let stats = engine.take_stats();
-    (engine.splats(), engine.poses(), [stats.loss.to_bits(), stats.ssim.to_bits()])
+    (
+        engine.splats(),
+        engine.poses(),
+        [stats.loss.to_bits(), stats.ssim.to_bits()],
+    )
 }
 
 fn mean_loss(engine: &mut CpuEngine, view_ix: usize, n_steps: u64) -> f64 {
@@ -242,18 +331,42 @@ fn photograph(splats: &Splats, cam_from_map: &Rigid) -> TrainingView {
     let mut engine = CpuEngine::new();
     engine.append(splats);
     let picture = engine.render(&intrinsics(), cam_from_map, 3);
-    let pixels = picture.rgb.iter().map(|c| (255.0 * c).round().clamp(0.0, 255.0) as u8).collect();
-    let confidence = picture.alpha.iter().map(|&a| if a > 0.7 { a } else { 0.0 }).collect();
+    let pixels = picture
+        .rgb
+        .iter()
+        .map(|c| (255.0 * c).round().clamp(0.0, 255.0) as u8)
+        .collect();
+    let confidence = picture
+        .alpha
+        .iter()
+        .map(|&a| if a > 0.7 { a } else { 0.0 })
+        .collect();
     TrainingView {
-        image: Arc::new(RgbImage { width_px: WIDTH_PX, height_px: HEIGHT_PX, pixels }),
+        image: Arc::new(RgbImage {
+            width_px: WIDTH_PX,
+            height_px: HEIGHT_PX,
+            pixels,
+        }),
         intrinsics: intrinsics(),
         cam_from_map: *cam_from_map,
-        depth: Some(Arc::new(DepthMap { width_px: WIDTH_PX, height_px: HEIGHT_PX, depth: picture.depth, confidence })),
+        depth: Some(Arc::new(DepthMap {
+            width_px: WIDTH_PX,
+            height_px: HEIGHT_PX,
+            depth: picture.depth,
+            confidence,
+        })),
     }
 }
 
 fn intrinsics() -> Intrinsics {
-    Intrinsics { width_px: WIDTH_PX, height_px: HEIGHT_PX, fx: 60.0, fy: 62.0, cx: 30.0, cy: 23.0 }
+    Intrinsics {
+        width_px: WIDTH_PX,
+        height_px: HEIGHT_PX,
+        fx: 60.0,
+        fy: 62.0,
+        cx: 30.0,
+        cy: 23.0,
+    }
 }
 
 fn side_pose() -> Rigid {
@@ -262,13 +375,27 @@ fn side_pose() -> Rigid {
 
 fn random_splats(n: usize, seed: u64) -> Splats {
     let mut rng = Pcg32::seed_from_u64(seed);
-    let mut splats = Splats { sh_degree: 3, anchors: vec![0; n], ..Splats::default() };
+    let mut splats = Splats {
+        sh_degree: 3,
+        anchors: vec![0; n],
+        ..Splats::default()
+    };
     for _ in 0..n {
-        splats.means.push([rng.random_range(-0.8..0.8), rng.random_range(-0.6..0.6), rng.random_range(0.8..2.5)]);
-        splats.log_scales.push(std::array::from_fn(|_| rng.random_range(-3.2..-1.8)));
-        splats.quats.push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
+        splats.means.push([
+            rng.random_range(-0.8..0.8),
+            rng.random_range(-0.6..0.6),
+            rng.random_range(0.8..2.5),
+        ]);
+        splats
+            .log_scales
+            .push(std::array::from_fn(|_| rng.random_range(-3.2..-1.8)));
+        splats
+            .quats
+            .push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
         splats.opacity_logits.push(rng.random_range(-1.5..3.0));
-        splats.sh.extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
+        splats
+            .sh
+            .extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
     }
     splats
 }
@@ -276,9 +403,19 @@ fn random_splats(n: usize, seed: u64) -> Splats {
 fn disturbed(splats: &Splats) -> Splats {
     let mut rng = Pcg32::seed_from_u64(99);
     let mut splats = splats.clone();
-    splats.means.as_flattened_mut().iter_mut().for_each(|x| *x += rng.random_range(-0.03..0.03));
-    splats.sh.iter_mut().for_each(|x| *x += rng.random_range(-0.1..0.1));
-    splats.opacity_logits.iter_mut().for_each(|x| *x += rng.random_range(-0.5..0.5));
+    splats
+        .means
+        .as_flattened_mut()
+        .iter_mut()
+        .for_each(|x| *x += rng.random_range(-0.03..0.03));
+    splats
+        .sh
+        .iter_mut()
+        .for_each(|x| *x += rng.random_range(-0.1..0.1));
+    splats
+        .opacity_logits
+        .iter_mut()
+        .for_each(|x| *x += rng.random_range(-0.5..0.5));
     splats
 }
 

@@ -5,7 +5,7 @@
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::bin::Tiles;
+use super::bin::{CUT_SLACK, Tiles};
 use super::lanes::{LANES, Lane, exp2, madd};
 use super::project::{MIN_ALPHA, ProjectedSplat, TILE_PX};
 use crate::splat::Rendering;
@@ -68,9 +68,8 @@ pub(crate) struct TileSplat {
     pub(crate) half_c: f32,
     pub(crate) color: [f32; 3],
     pub(crate) depth: f32,
-    /// Half-open.
-    rows: [u8; 2],
-    vectors: [u8; 2],
+    /// Bit v: the splat reaches a pixel of vector v.
+    reach: u32,
 }
 
 /// Composites all tiles.
@@ -78,14 +77,26 @@ pub fn raster(visible: &[ProjectedSplat], tiles: &Tiles, out: &mut Raster) {
     out.width_px = tiles.width_px as usize;
     out.height_px = tiles.height_px as usize;
     out.tiles.resize(tiles.n_tiles(), TilePixels::EMPTY);
-    out.tiles.par_iter_mut().enumerate().for_each(|(tile, pixels)| {
-        raster_tile(visible, tiles.of(tile), tiles.area(tile), pixels);
-    });
+    out.tiles
+        .par_iter_mut()
+        .enumerate()
+        .for_each(|(tile, pixels)| {
+            raster_tile(visible, tiles.of(tile), tiles.area(tile), pixels);
+        });
     unroll(tiles.n_x, out);
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn raster_tile(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, out: &mut TilePixels) {
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
+fn raster_tile(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    out: &mut TilePixels,
+) {
     multiversion::target::match_target! {
         "x86_64+avx2+fma" => composite::<true>(visible, instances, area, out),
         "aarch64+neon" => composite::<true>(visible, instances, area, out),
@@ -94,7 +105,12 @@ fn raster_tile(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, ou
 }
 
 #[inline(always)]
-fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, out: &mut TilePixels) {
+fn composite<const FMA: bool>(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    out: &mut TilePixels,
+) {
     out.clear(area);
     out.n_used = 0;
     let mut batch = [TileSplat::NONE; BATCH];
@@ -104,10 +120,8 @@ fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], are
         }
         out.n_used += instances.len() as u32;
         for splat in load_batch(visible, instances, area, &mut batch) {
-            for row in splat.rows() {
-                for half in splat.vectors() {
-                    blend::<FMA>(splat, row, half, out);
-                }
+            for v in splat.vectors() {
+                blend::<FMA>(splat, v, out);
             }
         }
     }
@@ -119,9 +133,8 @@ fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], are
 /// One vector of pixels. Everything goes through locals: LLVM makes masked stores of selects into memory, which
 /// stall the loads behind them.
 #[inline(always)]
-fn blend<const FMA: bool>(splat: &TileSplat, row: usize, half: usize, out: &mut TilePixels) {
-    let v = row * ROW_VECTORS + half;
-    let (x, dy) = (splat.x - (half * LANES) as f32, splat.y - row as f32);
+fn blend<const FMA: bool>(splat: &TileSplat, v: usize, out: &mut TilePixels) {
+    let (x, dy) = splat.offset_to(v);
     let [red, green, blue] = splat.color;
     let mut t = out.transmittance[v];
     let [mut r, mut g, mut b] = out.rgb.each_ref().map(|channel| channel[v]);
@@ -162,7 +175,11 @@ pub(crate) fn load_batch<'a>(
 #[inline(always)]
 pub(crate) fn start_transmittance(area: TileArea) -> [Lane; TILE_VECTORS] {
     let mut t = [[-1.0; LANES]; TILE_VECTORS];
-    for row in t.as_flattened_mut().chunks_exact_mut(TILE_PX).take(area.n_rows) {
+    for row in t
+        .as_flattened_mut()
+        .chunks_exact_mut(TILE_PX)
+        .take(area.n_rows)
+    {
         row[..area.n_columns].fill(1.0);
     }
     t
@@ -192,18 +209,22 @@ fn unroll(n_x: usize, out: &mut Raster) {
             plane.clear();
         }
         plane.resize(stride * out.height_px, 0.0);
-        plane.par_chunks_mut(stride).with_min_len(TILE_PX).enumerate().for_each(|(y, row)| {
-            let tile_row = &tiles[y / TILE_PX * n_x..][..n_x];
-            let row = &mut row[PLANE_MARGIN..][..width];
-            for (pixels, out) in tile_row.iter().zip(row.chunks_mut(TILE_PX)) {
-                let first = y % TILE_PX * TILE_PX;
-                let from = &pixels.plane(p)[first..][..out.len()];
-                out.copy_from_slice(from);
-                if p == 3 {
-                    out.iter_mut().for_each(|t| *t = 1.0 - *t);
+        plane
+            .par_chunks_mut(stride)
+            .with_min_len(TILE_PX)
+            .enumerate()
+            .for_each(|(y, row)| {
+                let tile_row = &tiles[y / TILE_PX * n_x..][..n_x];
+                let row = &mut row[PLANE_MARGIN..][..width];
+                for (pixels, out) in tile_row.iter().zip(row.chunks_mut(TILE_PX)) {
+                    let first = y % TILE_PX * TILE_PX;
+                    let from = &pixels.plane(p)[first..][..out.len()];
+                    out.copy_from_slice(from);
+                    if p == 3 {
+                        out.iter_mut().for_each(|t| *t = 1.0 - *t);
+                    }
                 }
-            }
-        });
+            });
     }
 }
 
@@ -241,46 +262,61 @@ impl TileSplat {
         half_c: 0.0,
         color: [0.0; 3],
         depth: 0.0,
-        rows: [0; 2],
-        vectors: [0; 2],
+        reach: 0,
     };
 
     #[inline(always)]
     fn new(splat: &ProjectedSplat, area: TileArea) -> Self {
         const LOG2_E: f32 = std::f32::consts::LOG2_E;
-        let x = splat.center[0] - (area.x as f32 + 0.5);
-        let y = splat.center[1] - (area.y as f32 + 0.5);
         let [a, b, c] = splat.conic;
-        let [half_x, half_y] = splat.half_px;
-        // Pixel k of a row is reached when |k - x| <= half_x; `as` cuts off, and takes negative to 0.
-        let first_row = (y - half_y + 0.99) as u8;
-        let end_row = ((y + half_y + 1.0) as u8).min(area.n_rows as u8);
-        let first_column = (x - half_x + 0.99) as u8;
-        let end_column = ((x + half_x + 1.0) as u8).min(area.n_columns as u8);
-        Self {
+        let mut local = Self {
             opacity: splat.opacity,
-            x,
-            y,
+            x: splat.center[0] - (area.x as f32 + 0.5),
+            y: splat.center[1] - (area.y as f32 + 0.5),
             half_a: -0.5 * LOG2_E * a,
             b: -LOG2_E * b,
             half_c: -0.5 * LOG2_E * c,
             color: splat.color,
             depth: splat.depth,
-            rows: [first_row, end_row],
-            vectors: [first_column / LANES as u8, end_column.div_ceil(LANES as u8)],
+            reach: 0,
+        };
+        local.reach = local.reach(-LOG2_E * (splat.cut + CUT_SLACK));
+        local
+    }
+
+    /// Vectors of which some point lies where the exponent is at least `cut`: its maximum along a row is that of a parabola.
+    #[inline(always)]
+    fn reach(&self, cut: f32) -> u32 {
+        let ridge = -0.5 * self.b / self.half_a;
+        let mut bits = [0u32; TILE_VECTORS];
+        for (v, bit) in bits.iter_mut().enumerate() {
+            let (high, dy) = self.offset_to(v);
+            let low = high - (LANES - 1) as f32;
+            let dx = ridge * dy;
+            let dx = if dx < low { low } else { dx };
+            let dx = if dx > high { high } else { dx };
+            let exponent = (self.half_a * dx + self.b * dy) * dx + self.half_c * dy * dy;
+            *bit = if exponent < cut { 0 } else { 1 << v };
         }
+        bits.iter().fold(0, |all, bit| all | bit)
     }
 
-    /// Rows of the tile that the splat's box reaches.
+    /// From the centre of a vector's first pixel to the splat's centre.
     #[inline(always)]
-    pub(crate) fn rows(&self) -> std::ops::Range<usize> {
-        usize::from(self.rows[0])..usize::from(self.rows[1])
+    pub(crate) fn offset_to(&self, v: usize) -> (f32, f32) {
+        let (row, half) = (v / ROW_VECTORS, v % ROW_VECTORS);
+        (self.x - (half * LANES) as f32, self.y - row as f32)
     }
 
-    /// Vectors of a row that the box reaches.
+    /// Vectors of the tile that the splat reaches.
     #[inline(always)]
-    pub(crate) fn vectors(&self) -> std::ops::Range<usize> {
-        usize::from(self.vectors[0])..usize::from(self.vectors[1])
+    pub(crate) fn vectors(&self) -> impl Iterator<Item = usize> {
+        let mut left = self.reach;
+        std::iter::from_fn(move || {
+            let v = left.trailing_zeros();
+            left &= left.wrapping_sub(1);
+            (v < u32::BITS).then_some(v as usize)
+        })
     }
 
     /// Alpha of a pixel, 0 where it is too faint to count, and whether it is below the upper clamp.
@@ -327,9 +363,16 @@ impl Raster {
         };
         for y in 0..self.height_px {
             let [r, g, b, alpha, depth_sum] = std::array::from_fn(|p| self.row(p, y));
-            rendering.rgb.extend(r.iter().zip(g).zip(b).flat_map(|((&r, &g), &b)| [r, g, b]));
+            rendering
+                .rgb
+                .extend(r.iter().zip(g).zip(b).flat_map(|((&r, &g), &b)| [r, g, b]));
             rendering.alpha.extend_from_slice(alpha);
-            rendering.depth.extend(depth_sum.iter().zip(alpha).map(|(&d, &a)| if a > 0.0 { d / a } else { 0.0 }));
+            rendering.depth.extend(
+                depth_sum
+                    .iter()
+                    .zip(alpha)
+                    .map(|(&d, &a)| if a > 0.0 { d / a } else { 0.0 }),
+            );
         }
         rendering
     }

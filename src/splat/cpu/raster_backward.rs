@@ -10,7 +10,8 @@ use super::lanes::{LANES, Lane, madd};
 use super::loss::PixelGradients;
 use super::project::{ProjectedSplat, TILE_PX};
 use super::raster::{
-    BATCH, MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea, TilePixels, TileSplat, load_batch, start_transmittance,
+    BATCH, MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea,
+    TilePixels, TileSplat, load_batch, start_transmittance,
 };
 
 /// d loss / d one instance.
@@ -66,8 +67,15 @@ pub fn raster_backward(
         n_slots += tile.n_used;
         out.starts.push(n_slots);
     }
-    out.slots.resize(n_slots as usize, InstanceGradient::default());
-    let job = Job { visible, tiles, raster, pixels, starts: &out.starts };
+    out.slots
+        .resize(n_slots as usize, InstanceGradient::default());
+    let job = Job {
+        visible,
+        tiles,
+        raster,
+        pixels,
+        starts: &out.starts,
+    };
     job.run(0, raster.tiles.len(), &mut out.slots);
 }
 
@@ -85,17 +93,32 @@ impl Job<'_> {
     fn run(self, first: usize, end: usize, slots: &mut [InstanceGradient]) {
         if end - first > 1 {
             let middle = usize::midpoint(first, end);
-            let (left, right) = slots.split_at_mut((self.starts[middle] - self.starts[first]) as usize);
-            rayon::join(|| self.run(first, middle, left), || self.run(middle, end, right));
+            let (left, right) =
+                slots.split_at_mut((self.starts[middle] - self.starts[first]) as usize);
+            rayon::join(
+                || self.run(first, middle, left),
+                || self.run(middle, end, right),
+            );
         } else if first < end && !slots.is_empty() {
             let area = self.tiles.area(first);
-            let mut gradients = TileGradients::load(self.raster, self.pixels, &self.raster.tiles[first], area);
-            raster_backward_tile(self.visible, self.tiles.of(first), area, &mut gradients, slots);
+            let mut gradients =
+                TileGradients::load(self.raster, self.pixels, &self.raster.tiles[first], area);
+            raster_backward_tile(
+                self.visible,
+                self.tiles.of(first),
+                area,
+                &mut gradients,
+                slots,
+            );
         }
     }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
 fn raster_backward_tile(
     visible: &[ProjectedSplat],
     instances: &[u32],
@@ -123,10 +146,8 @@ fn walk<const FMA: bool>(
         let splats = load_batch(visible, &instances[..out.len()], area, &mut batch);
         for ((splat, out), &ix) in splats.iter().zip(out).zip(instances) {
             let mut sums = ColumnSums::default();
-            for row in splat.rows() {
-                for half in splat.vectors() {
-                    add_pixels::<FMA>(splat, row, half, pixels, &mut sums);
-                }
+            for v in splat.vectors() {
+                add_pixels::<FMA>(splat, v, pixels, &mut sums);
             }
             *out = sums.gradient(splat, visible[ix as usize].conic);
         }
@@ -137,13 +158,12 @@ fn walk<const FMA: bool>(
 #[inline(always)]
 fn add_pixels<const FMA: bool>(
     splat: &TileSplat,
-    row: usize,
-    half: usize,
+    p: usize,
     pixels: &mut TileGradients,
     sums: &mut ColumnSums,
 ) {
-    let p = row * ROW_VECTORS + half;
-    let (x, dy) = (splat.x - (half * LANES) as f32, splat.y - row as f32);
+    let half = p % ROW_VECTORS;
+    let (x, dy) = splat.offset_to(p);
     let [red, green, blue] = splat.color;
     let (mut t, mut behind) = (pixels.transmittance[p], pixels.behind[p]);
     let [v_r, v_g, v_b, v_z] = pixels.v.each_ref().map(|v| v[p]);
@@ -160,7 +180,11 @@ fn add_pixels<const FMA: bool>(
         behind[i] = madd::<FMA>(-weight, seen, behind[i]);
         let v_alpha = madd::<FMA>(t[i], seen, -behind[i] / (1.0 - alpha));
         // Alpha 0 stands for a pixel that the splat does not reach.
-        let v_sigma = if is_free & !is_over { -alpha * v_alpha } else { 0.0 };
+        let v_sigma = if is_free & !is_over {
+            -alpha * v_alpha
+        } else {
+            0.0
+        };
         m0[i] += v_sigma;
         m1[i] = madd::<FMA>(v_sigma, dy, m1[i]);
         m2[i] = madd::<FMA>(v_sigma, dy * dy, m2[i]);
@@ -219,12 +243,20 @@ fn total(lanes: &[f32]) -> f32 {
 }
 
 impl TileGradients {
-    fn load(raster: &Raster, gradients: &PixelGradients, tile: &TilePixels, area: TileArea) -> Self {
+    fn load(
+        raster: &Raster,
+        gradients: &PixelGradients,
+        tile: &TilePixels,
+        area: TileArea,
+    ) -> Self {
         let mut v = [[[0.0; LANES]; TILE_VECTORS]; 4];
         let mut behind = [[0.0; LANES]; TILE_VECTORS];
         for row in 0..area.n_rows {
             let first = (area.y + row) * raster.stride + PLANE_MARGIN + area.x;
-            let [v_r, v_g, v_b, v_a, v_z] = gradients.planes.each_ref().map(|plane| &plane[first..][..area.n_columns]);
+            let [v_r, v_g, v_b, v_a, v_z] = gradients
+                .planes
+                .each_ref()
+                .map(|plane| &plane[first..][..area.n_columns]);
             for (v, from) in v.iter_mut().zip([v_r, v_g, v_b, v_z]) {
                 v.as_flattened_mut()[row * TILE_PX..][..area.n_columns].copy_from_slice(from);
             }
@@ -232,9 +264,14 @@ impl TileGradients {
             for (x, (behind, v_a)) in behind.iter_mut().zip(v_a).enumerate() {
                 let at = |plane: &[Lane; TILE_VECTORS]| plane.as_flattened()[row * TILE_PX + x];
                 let [r, g, b] = tile.rgb.each_ref().map(at);
-                *behind = r * v_r[x] + g * v_g[x] + b * v_b[x] + at(&tile.depth_sum) * v_z[x] - at(&tile.transmittance) * v_a;
+                *behind = r * v_r[x] + g * v_g[x] + b * v_b[x] + at(&tile.depth_sum) * v_z[x]
+                    - at(&tile.transmittance) * v_a;
             }
         }
-        Self { v, behind, transmittance: start_transmittance(area) }
+        Self {
+            v,
+            behind,
+            transmittance: start_transmittance(area),
+        }
     }
 }
