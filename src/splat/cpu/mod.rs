@@ -15,7 +15,7 @@ pub mod raster_backward;
 mod sh;
 mod ssim;
 
-use adam::{Attribute, Correction, Moments};
+use adam::{Optimiser, retain_rows};
 use bin::Tiles;
 use loss::{LossValue, PixelGradients, Target};
 use pose_adam::PoseAdam;
@@ -24,7 +24,10 @@ use project_backward::{Forward, SplatGradients};
 use raster::Raster;
 use raster_backward::InstanceGradients;
 
+use std::sync::Arc;
+
 use crate::camera::Intrinsics;
+use crate::frame::DepthMap;
 use crate::pose::Rigid;
 use crate::splat::{Engine, Rendering, Splats, StepSettings, StepStats, TrainingView};
 
@@ -64,19 +67,6 @@ pub struct Gradients {
 struct View {
     view: TrainingView,
     adam: PoseAdam,
-}
-
-/// Adam's state, in the layout of `Splats`.
-#[derive(Debug, Default)]
-struct Optimiser {
-    means: Moments,
-    log_scales: Moments,
-    quats: Moments,
-    opacity_logits: Moments,
-    sh: Moments,
-    /// Updates that each splat has had.
-    ages: Vec<u32>,
-    corrections: Vec<Correction>,
 }
 
 /// Buffers of one way there and back.
@@ -178,11 +168,7 @@ impl Engine for CpuEngine {
         retain_rows(&mut all.opacity_logits, 1, keep);
         retain_rows(&mut all.sh, sh_stride, keep);
         retain_rows(&mut all.anchors, 1, keep);
-        retain_rows(&mut self.optimiser.ages, 1, keep);
-        for (moments, stride) in self.optimiser.moments_mut(sh_stride) {
-            retain_rows(&mut moments.first, stride, keep);
-            retain_rows(&mut moments.second, stride, keep);
-        }
+        self.optimiser.retain(sh_stride, keep);
     }
 
     fn overwrite(&mut self, splats: &Splats) {
@@ -225,6 +211,10 @@ impl Engine for CpuEngine {
         view.adam = PoseAdam::default();
     }
 
+    fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
+        self.views[view_ix].view.depth = depth;
+    }
+
     fn step(&mut self, view_ix: usize, settings: &StepSettings) {
         let view = &mut self.views[view_ix];
         let value = self.pass.differentiate(&self.splats, &view.view, settings);
@@ -247,9 +237,12 @@ impl Engine for CpuEngine {
             }
         }
         if settings.train_splats {
-            n_skipped += self
-                .optimiser
-                .update(&mut self.splats, &self.pass, settings);
+            n_skipped += self.optimiser.update(
+                &mut self.splats,
+                &self.pass.projected,
+                &self.pass.gradients,
+                settings,
+            );
         }
         self.count_skipped(n_skipped);
     }
@@ -335,93 +328,6 @@ impl Pass {
     }
 }
 
-impl Optimiser {
-    fn resize(&mut self, splats: &Splats) {
-        let n = splats.len();
-        self.ages.resize(n, 0);
-        for (moments, stride) in self.moments_mut(splats.sh_stride()) {
-            moments.resize(n * stride);
-        }
-    }
-
-    /// With the numbers of one splat: `retain_rows` and `resize` need them, since moments are flat.
-    fn moments_mut(&mut self, sh_stride: usize) -> [(&mut Moments, usize); 5] {
-        [
-            (&mut self.means, 3),
-            (&mut self.log_scales, 3),
-            (&mut self.quats, 4),
-            (&mut self.opacity_logits, 1),
-            (&mut self.sh, sh_stride),
-        ]
-    }
-
-    /// Returns the number of splats left alone because their gradient is not finite.
-    fn update(&mut self, splats: &mut Splats, pass: &Pass, settings: &StepSettings) -> usize {
-        let (projected, g) = (&pass.projected, &pass.gradients);
-        let n_skipped = adam::age(
-            projected,
-            &g.is_finite,
-            &mut self.ages,
-            &mut self.corrections,
-        );
-        let sh_stride = splats.sh_stride();
-        let one = |rate| [rate, rate];
-        let corrections = &self.corrections;
-        let run = |params, moments, [stride, grad_stride]: [usize; 2], grads, rates| {
-            adam::adam(
-                Attribute {
-                    params,
-                    moments,
-                    stride,
-                    grads,
-                    grad_stride,
-                    rates,
-                },
-                projected,
-                corrections,
-            );
-        };
-        run(
-            splats.means.as_flattened_mut(),
-            &mut self.means,
-            [3, 3],
-            g.means.as_flattened(),
-            one(settings.lr_mean),
-        );
-        let scales = g.log_scales.as_flattened();
-        run(
-            splats.log_scales.as_flattened_mut(),
-            &mut self.log_scales,
-            [3, 3],
-            scales,
-            one(settings.lr_scale),
-        );
-        run(
-            splats.quats.as_flattened_mut(),
-            &mut self.quats,
-            [4, 4],
-            g.quats.as_flattened(),
-            one(settings.lr_quat),
-        );
-        run(
-            &mut splats.opacity_logits,
-            &mut self.opacity_logits,
-            [1, 1],
-            &g.opacity_logits,
-            one(settings.lr_opacity),
-        );
-        let sh_rates = [settings.lr_sh0, settings.lr_sh_rest];
-        run(
-            &mut splats.sh,
-            &mut self.sh,
-            [sh_stride, g.sh_stride],
-            &g.sh,
-            sh_rates,
-        );
-        n_skipped
-    }
-}
-
 impl Splats {
     /// Our own mistake when it fails: readers of files check before.
     fn assert_consistent(&self) {
@@ -444,16 +350,6 @@ impl Splats {
             "SH has `sh_stride` numbers a splat"
         );
     }
-}
-
-/// Keeps row i of `stride` values when `keep[i]`.
-fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[bool]) {
-    let mut end = 0;
-    for (i, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
-        values.copy_within(i * stride..(i + 1) * stride, end);
-        end += stride;
-    }
-    values.truncate(end);
 }
 
 fn instruction_set() -> &'static str {
