@@ -67,6 +67,11 @@ fn ranked_pairs(scene: &mut Scene, waiting: &[usize], limits: &Limits) -> (Vec<(
             continue;
         }
         let plane = homography_share(&pixels, limits.max_error_px, seed);
+        let is_calibrated = scene.shots[a].is_calibrated && scene.shots[b].is_calibrated;
+        // With a wrong focal length a mere turn looks like parallax.
+        if plane > PLANE_SHARE && !is_calibrated && scene.components.is_empty() {
+            continue;
+        }
         let flat = if plane > PLANE_SHARE { 0.1 } else { 1.0 };
         pairs.push((flat * n as f64 * parallax.min(ENOUGH_PARALLAX_DEG), a, b));
         if let Some(link) = scene.links.get_mut(&(a, b)) {
