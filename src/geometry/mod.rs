@@ -1,5 +1,7 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
+pub mod known;
+pub mod mvs;
 pub mod scale_space;
 pub mod features;
 pub mod matching;
@@ -54,7 +56,12 @@ pub struct GeometryBatch {
 #[derive(Debug, thiserror::Error)]
 pub enum GeometryError {
     #[error("{model} needs {needs} for keyframe {keyframe_id}, found none; {way_out}")]
-    Missing { model: &'static str, needs: &'static str, keyframe_id: u32, way_out: &'static str },
+    Missing {
+        model: &'static str,
+        needs: &'static str,
+        keyframe_id: u32,
+        way_out: &'static str,
+    },
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
 }
