@@ -13,6 +13,5 @@ mod render;
 mod report;
 mod scenes;
 mod sfm;
-mod sfm_measure;
 mod shaders;
 mod synthetic;
