@@ -245,7 +245,8 @@ fn conditioning(points: impl Iterator<Item = DVec2> + Clone) -> DMat3 {
     DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, DVec3::new(-mean.x * scale, -mean.y * scale, 1.0))
 }
 
-fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
+/// Least squares over all pairs (Hartley 1997); at least eight.
+pub fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
     if pairs.len() < 8 {
         return None;
     }

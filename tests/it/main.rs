@@ -18,7 +18,6 @@ mod render_poses;
 mod report;
 mod scenes;
 mod sfm;
-mod sfm_measure;
 mod shaders;
 mod synthetic;
 mod trajectory;

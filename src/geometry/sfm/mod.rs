@@ -5,6 +5,7 @@
 
 mod adjusting;
 mod densify;
+mod calibrating;
 mod landmarks;
 mod links;
 mod merging;
@@ -19,6 +20,7 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
 use self::densify::Densifier;
+use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use self::links::{link_alike, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
@@ -153,24 +155,36 @@ impl Sfm {
 
     fn guessed_lens(&self, width_px: u32, height_px: u32) -> Intrinsics {
         let (w, h) = (f64::from(width_px), f64::from(height_px));
-        let earlier = self.scene.shots.iter().rev().find(|s| !s.is_calibrated);
-        let share = earlier.map(|s| s.lens.fx / f64::from(s.lens.width_px.max(s.lens.height_px)));
         let guess = if self.sfm.focal_guess > 0.0 { self.sfm.focal_guess } else { FIRST_FOCAL * w.max(h) };
-        let f = share.map_or(guess, |share| share * w.max(h));
+        let f = current_share(&self.scene).map_or(guess, |share| share * w.max(h));
         Intrinsics { width_px, height_px, fx: f, fy: f, cx: 0.5 * w, cy: 0.5 * h }
+    }
+
+    /// Starts a component of the waiting shots, if there are enough of them.
+    fn try_start(&mut self, pool: &[usize], min_shots: usize, limits: &Limits) -> Option<Start> {
+        let is_first = self.scene.components.is_empty();
+        let waiting = pool.iter().filter(|&&s| self.scene.shots[s].placed.is_none());
+        let n_uncalibrated = waiting.clone().filter(|&&s| !self.scene.shots[s].is_calibrated).count();
+        let n_waiting = waiting.count();
+        let needed = if is_first { pool.len().min(3) } else { min_shots };
+        if n_waiting < needed.max(2) {
+            return None;
+        }
+        if !is_first || n_uncalibrated == 0 {
+            return Some(start(&mut self.scene, pool, needed, limits));
+        }
+        let is_last_chance = min_shots < MIN_NEW_COMPONENT;
+        if n_waiting < MIN_UNCALIBRATED && !is_last_chance {
+            return None;
+        }
+        let guess = (self.sfm.focal_guess > 0.0).then(|| current_share(&self.scene)).flatten();
+        Some(start_uncalibrated(&mut self.scene, pool, guess, limits))
     }
 
     fn place_waiting(&mut self, limits: &Limits, min_shots: usize) {
         let pool: Vec<usize> = (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect();
         grow(&mut self.scene, &pool, limits);
-        loop {
-            let is_first = self.scene.components.is_empty();
-            let needed = if is_first { pool.len().min(3) } else { min_shots };
-            let n_waiting = pool.iter().filter(|&&s| self.scene.shots[s].placed.is_none()).count();
-            if n_waiting < needed.max(2) {
-                break;
-            }
-            let outcome = start(&mut self.scene, &pool, needed, limits);
+        while let Some(outcome) = self.try_start(&pool, min_shots, limits) {
             self.last_start = Some(outcome);
             if outcome != Start::Started {
                 break;
