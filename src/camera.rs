@@ -47,14 +47,25 @@ impl Intrinsics {
 
     /// Point with z = 1 on the ray through a pixel.
     pub fn ray_in_cam(&self, pixel: DVec2) -> DVec3 {
-        DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+        DVec3::new(
+            (pixel.x - self.cx) / self.fx,
+            (pixel.y - self.cy) / self.fy,
+            1.0,
+        )
     }
 
     /// The same camera with its picture resized; a resize may change the aspect.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
         let sy = f64::from(height_px) / f64::from(self.height_px);
-        Self { width_px, height_px, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
+        Self {
+            width_px,
+            height_px,
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+        }
     }
 
     /// Finite, positive focal lengths and a principal point within one picture of the centre.
@@ -63,8 +74,12 @@ impl Intrinsics {
         let longest = w.max(h);
         let focal_fits = |f: f64| f.is_finite() && f > 0.05 * longest && f < 100.0 * longest;
         let centre_fits = |c: f64, side: f64| c.is_finite() && c > -side && c < 2.0 * side;
-        w > 0.0 && h > 0.0 && focal_fits(self.fx) && focal_fits(self.fy)
-            && centre_fits(self.cx, w) && centre_fits(self.cy, h)
+        w > 0.0
+            && h > 0.0
+            && focal_fits(self.fx)
+            && focal_fits(self.fy)
+            && centre_fits(self.cx, w)
+            && centre_fits(self.cy, h)
     }
 }
 
@@ -105,7 +120,11 @@ impl Distortion {
             Self::Equidistant(k) => {
                 let radius = ideal.length();
                 // The ratio angle / radius tends to 1; below this radius it is 1 to the last digit.
-                if radius < 1e-9 { ideal } else { ideal * (fisheye(k, radius.atan()).0 / radius) }
+                if radius < 1e-9 {
+                    ideal
+                } else {
+                    ideal * (fisheye(k, radius.atan()).0 / radius)
+                }
             }
         }
     }
@@ -151,7 +170,9 @@ impl Lens {
     /// Pixel of a point in the camera frame, through the real lens; `None` at or behind the camera.
     pub fn project(&self, point_in_cam: DVec3) -> Option<DVec2> {
         (point_in_cam.z > 1e-9).then(|| {
-            let landed = self.distortion.distort(point_in_cam.truncate() / point_in_cam.z);
+            let landed = self
+                .distortion
+                .distort(point_in_cam.truncate() / point_in_cam.z);
             let i = &self.intrinsics;
             DVec2::new(i.fx * landed.x + i.cx, i.fy * landed.y + i.cy)
         })
@@ -160,12 +181,17 @@ impl Lens {
     /// Point with z = 1 on the ray that lands on a pixel; `None` where no ray in front of the camera does.
     pub fn ray_in_cam(&self, pixel: DVec2) -> Option<DVec3> {
         let landed = self.intrinsics.ray_in_cam(pixel).truncate();
-        self.distortion.undistort(landed).map(|ideal| ideal.extend(1.0))
+        self.distortion
+            .undistort(landed)
+            .map(|ideal| ideal.extend(1.0))
     }
 
     /// The same lens with its picture resized; coefficients live on the plane z = 1 and stay.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
-        Self { intrinsics: self.intrinsics.resized(width_px, height_px), distortion: self.distortion }
+        Self {
+            intrinsics: self.intrinsics.resized(width_px, height_px),
+            distortion: self.distortion,
+        }
     }
 }
 
@@ -179,7 +205,10 @@ fn radial(k: &[f64; 8], r2: f64) -> (f64, f64) {
     let below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]));
     let above_rate = k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4]);
     let below_rate = k[5] + r2 * (2.0 * k[6] + r2 * 3.0 * k[7]);
-    (above / below, (above_rate * below - above * below_rate) / (below * below))
+    (
+        above / below,
+        (above_rate * below - above * below_rate) / (below * below),
+    )
 }
 
 /// Brown-Conrady with rational radial part: where the ray lands, and the derivative of that.
@@ -193,8 +222,14 @@ fn brown(k: &[f64; 8], p: DVec2) -> (DVec2, DMat2) {
     );
     let mixed = 2.0 * p.x * p.y * rate + 2.0 * p1 * p.x + 2.0 * p2 * p.y;
     let derivative = DMat2::from_cols(
-        DVec2::new(factor + 2.0 * p.x * p.x * rate + 2.0 * p1 * p.y + 6.0 * p2 * p.x, mixed),
-        DVec2::new(mixed, factor + 2.0 * p.y * p.y * rate + 6.0 * p1 * p.y + 2.0 * p2 * p.x),
+        DVec2::new(
+            factor + 2.0 * p.x * p.x * rate + 2.0 * p1 * p.y + 6.0 * p2 * p.x,
+            mixed,
+        ),
+        DVec2::new(
+            mixed,
+            factor + 2.0 * p.y * p.y * rate + 6.0 * p1 * p.y + 2.0 * p2 * p.x,
+        ),
     );
     (landed, derivative)
 }
