@@ -155,8 +155,9 @@ impl Distortion {
         let mut radius = 0.0;
         while radius < MAX_RADIUS {
             let next = lands_at(radius + RADIUS_STEP);
-            // Written so that NaN ends the loop too.
-            if !(next > last) {
+            // False for NaN, which ends the loop too.
+            let grows = next > last;
+            if !grows {
                 break;
             }
             last = next;
@@ -235,29 +236,32 @@ fn brown(k: &[f64; 8], p: DVec2) -> (DVec2, DMat2) {
 }
 
 fn undistort_brown(k: &[f64; 8], distorted: DVec2) -> Option<DVec2> {
-    let mut ideal = distorted;
+    let is_before_fold = |p: DVec2| brown(k, p).1.determinant() > 1e-12;
+    // A strong pincushion shows rays far out, where the polynomial may have folded; the axis is always before it.
+    let mut ideal = if is_before_fold(distorted) {
+        distorted
+    } else {
+        DVec2::ZERO
+    };
     let mut residual = brown(k, ideal).0 - distorted;
     for _ in 0..MAX_NEWTON_STEPS {
-        let (_, derivative) = brown(k, ideal);
-        // A derivative that has turned over belongs to the part beyond the fold.
-        if !(derivative.determinant() > 1e-12) {
+        if !is_before_fold(ideal) {
             return None;
         }
-        if residual.length() < 1e-15 {
-            break;
-        }
-        let step = derivative.inverse() * residual;
+        let step = brown(k, ideal).1.inverse() * residual;
+        let at_share = |share: f64| {
+            let next = ideal - step * share;
+            (next, brown(k, next).0 - distorted)
+        };
         // Halving keeps Newton from jumping over the fold of a strong polynomial.
-        let mut share = 1.0;
-        let (mut next, mut next_residual) = (ideal - step, brown(k, ideal - step).0 - distorted);
-        while !(next_residual.length() <= residual.length()) && share > 1e-3 {
-            share *= 0.5;
-            next = ideal - step * share;
-            next_residual = brown(k, next).0 - distorted;
-        }
-        if !(next_residual.length() < residual.length()) {
+        let shares = std::iter::successors(Some(1.0), |share| Some(share * 0.5)).take(10);
+        let better = shares
+            .map(at_share)
+            .find(|(_, next)| next.length() < residual.length());
+        // None is better when the residual is down to rounding errors.
+        let Some((next, next_residual)) = better else {
             break;
-        }
+        };
         (ideal, residual) = (next, next_residual);
     }
     (residual.length() < SOLVED && radial(k, ideal.length_squared()).0 > 0.0).then_some(ideal)
@@ -279,7 +283,8 @@ fn undistort_fisheye(k: &[f64; 4], distorted: DVec2) -> Option<DVec2> {
     let mut angle = shown.min(1.5);
     for _ in 0..MAX_NEWTON_STEPS {
         let (at, rate) = fisheye(k, angle);
-        if !(rate > 1e-6) {
+        let is_before_fold = rate > 1e-6;
+        if !is_before_fold {
             return None;
         }
         let step = (at - shown) / rate;

@@ -218,7 +218,7 @@ fn lens_of(folder: &Path) -> Option<Lens> {
         tracing::warn!(
             "camera counts as uncalibrated, found {found}: {}",
             path.display()
-        )
+        );
     })
     .ok()
 }

@@ -116,16 +116,16 @@ fn widest_pinhole(lens: &Lens) -> Option<Intrinsics> {
     let smallest = (width * 0.5 / half.x / source.fx).max(height * 0.5 / half.y / source.fy) * 0.8;
     let largest = 1.0 / MIN_VIEW_SHARE;
     let fits = |scale: f64| sees_only_picture(lens, &at_scale(scale), max_radius);
-    if !(smallest.is_finite() && smallest > 0.0) || !fits(largest.max(smallest)) {
+    if !(smallest.is_finite() && smallest > 0.0 && fits(largest.max(smallest))) {
         return None;
     }
     let (mut too_wide, mut fitting) = (smallest, largest.max(smallest));
     for _ in 0..40 {
         let middle = 0.5 * (too_wide + fitting);
         if fits(middle) {
-            fitting = middle
+            fitting = middle;
         } else {
-            too_wide = middle
+            too_wide = middle;
         }
     }
     // One ten-thousandth keeps the rim off the last half pixel after rounding.

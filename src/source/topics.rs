@@ -106,7 +106,7 @@ pub(super) fn lens_of(survey: &Survey, image_topic: &str, params: &SourceParams)
     let found = lens_of_camera_info(info, is_rectified(image_topic, info));
     found
         .inspect_err(|found| {
-            tracing::warn!("camera counts as uncalibrated, {topic:?} says: {found}")
+            tracing::warn!("camera counts as uncalibrated, {topic:?} says: {found}");
         })
         .ok()
 }

@@ -95,11 +95,6 @@ impl BagWriter {
             .unwrap();
     }
 
-    /// Closes the chunk being written.
-    pub fn end_chunk(&mut self) {
-        self.writer.flush().unwrap();
-    }
-
     pub fn finish(mut self) -> Vec<u8> {
         self.writer.finish().unwrap();
         self.writer.into_inner().into_inner()
