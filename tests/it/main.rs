@@ -4,6 +4,7 @@
 
 #[cfg(feature = "zenoh")]
 
+mod backends;
 mod bags;
 mod declared_lengths;
 mod engine;
