@@ -1,1 +1,190 @@
-fn main(){}
+//! Time of each stage of a step and of whole steps, CPU engine, 270x480, by number of splats.
+//!
+//! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have.
+
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::Duration;
+
+use criterion::{
+    BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime,
+};
+use glam::{DQuat, DVec3};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg32;
+use splat_mapper::camera::Intrinsics;
+use splat_mapper::frame::{DepthMap, RgbImage};
+use splat_mapper::pose::Rigid;
+use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
+use splat_mapper::splat::cpu::raster_backward::{InstanceGradients, raster_backward};
+use splat_mapper::splat::cpu::{CpuEngine, bin, loss, project, raster};
+use splat_mapper::splat::{Engine, Splats, StepSettings, TrainingView};
+
+const WIDTH_PX: u32 = 270;
+const HEIGHT_PX: u32 = 480;
+const FOCAL_PX: f64 = 350.0;
+
+/// Name, number of splats, and the mean size that gives the wanted splats per tile.
+const SIZES: [(&str, usize, f64); 3] = [
+    ("10k", 10_000, 4.0),
+    ("20k", 20_000, 3.0),
+    ("54k", 54_000, 2.0),
+];
+
+criterion_group!(benches, stages);
+criterion_main!(benches);
+
+fn stages(c: &mut Criterion) {
+    for (name, n, size_px) in SIZES {
+        let (splats, view) = scene(n, size_px);
+        let mut group = c.benchmark_group("step");
+        configure(&mut group);
+        let mut engine = CpuEngine::new();
+        engine.append(&splats);
+        let view_ix = engine.add_view(view.clone());
+        group.bench_function(name, |b| b.iter(|| engine.step(view_ix, &settings())));
+        group.finish();
+        each_stage(c, name, &splats, &view);
+    }
+}
+
+fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingView) {
+    let settings = settings();
+    let camera = project::Camera::new(&view.intrinsics, &view.cam_from_map);
+    let target = loss::Target {
+        image: &view.image,
+        depth: view.depth.as_deref(),
+    };
+    let (mut projected, mut tiles, mut picture) = (
+        project::Projected::default(),
+        bin::Tiles::default(),
+        raster::Raster::default(),
+    );
+    let mut pixels = loss::PixelGradients::default();
+    let (mut instances, mut gradients) = (InstanceGradients::default(), SplatGradients::default());
+    let mut bench = |stage: &str, run: &mut dyn FnMut()| {
+        // Once outside of the measurement: a filter may leave it out, and the next stage needs the result.
+        run();
+        let mut group = c.benchmark_group(stage);
+        configure(&mut group);
+        group.bench_function(name, |b| b.iter(&mut *run));
+        group.finish();
+    };
+    bench("project", &mut || {
+        project::project(black_box(splats), &camera, 3, &mut projected);
+    });
+    let visible = &projected.splats;
+    bench("bin", &mut || {
+        bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles);
+    });
+    bench("raster", &mut || {
+        raster::raster(visible, &tiles, &mut picture);
+    });
+    bench("loss", &mut || {
+        black_box(loss::loss(&picture, &target, &settings, &mut pixels));
+    });
+    bench("raster_backward", &mut || {
+        raster_backward(visible, &tiles, &picture, &pixels, &mut instances);
+    });
+    let forward = Forward {
+        splats,
+        camera: &camera,
+        visible,
+        tiles: &tiles,
+    };
+    bench("project_backward", &mut || {
+        project_backward(forward, &instances, &settings, &mut gradients);
+    });
+    #[expect(clippy::print_stderr, reason = "says what was measured")]
+    {
+        let per_tile = tiles.instances.len() / tiles.n_tiles();
+        let used = 100 * instances.slots.len() / tiles.instances.len();
+        eprintln!(
+            "{name}: {} visible, {per_tile} instances per tile, {used} % of them used\n",
+            visible.len()
+        );
+    }
+}
+
+fn configure(group: &mut BenchmarkGroup<'_, WallTime>) {
+    group.throughput(Throughput::Elements(1));
+    group
+        .sample_size(20)
+        .warm_up_time(Duration::from_secs(1))
+        .measurement_time(Duration::from_secs(3));
+}
+
+fn settings() -> StepSettings {
+    StepSettings {
+        lr_mean: 1.6e-6,
+        lr_scale: 5e-5,
+        lr_quat: 1e-5,
+        lr_opacity: 5e-4,
+        lr_sh0: 2.5e-5,
+        lr_sh_rest: 1e-6,
+        lr_pose_rotation: 1e-7,
+        lr_pose_translation: 1e-7,
+        ssim_weight: 0.2,
+        depth_weight: 0.05,
+        opacity_reg: 0.01,
+        scale_reg: 0.01,
+        sh_degree: 3,
+        train_splats: true,
+        train_pose: true,
+    }
+}
+
+fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
+    let mut rng = Pcg32::seed_from_u64(7);
+    let mut splats = Splats {
+        sh_degree: 3,
+        ..Splats::default()
+    };
+    for _ in 0..n {
+        let z = rng.random_range(0.5..3.0);
+        let x = (rng.random_range(-5.0..f64::from(WIDTH_PX) + 5.0) - 0.5 * f64::from(WIDTH_PX)) * z
+            / FOCAL_PX;
+        let y = (rng.random_range(-5.0..f64::from(HEIGHT_PX) + 5.0) - 0.5 * f64::from(HEIGHT_PX))
+            * z
+            / FOCAL_PX;
+        splats.means.push([x as f32, y as f32, z as f32]);
+        let size = (size_px * z / FOCAL_PX).ln();
+        splats.log_scales.push(std::array::from_fn(|_| {
+            (size + rng.random_range(-1.2..0.7)) as f32
+        }));
+        splats
+            .quats
+            .push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
+        splats.opacity_logits.push(rng.random_range(-3.0..2.0));
+        splats
+            .sh
+            .extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
+        splats.anchors.push(0);
+    }
+    let n_pixels = (WIDTH_PX * HEIGHT_PX) as usize;
+    let pixels = (0..3 * n_pixels).map(|_| rng.random()).collect();
+    let depth = DepthMap {
+        width_px: WIDTH_PX,
+        height_px: HEIGHT_PX,
+        depth: (0..n_pixels).map(|_| rng.random_range(0.5..3.0)).collect(),
+        confidence: vec![1.0; n_pixels],
+    };
+    let view = TrainingView {
+        image: Arc::new(RgbImage {
+            width_px: WIDTH_PX,
+            height_px: HEIGHT_PX,
+            pixels,
+        }),
+        intrinsics: Intrinsics {
+            width_px: WIDTH_PX,
+            height_px: HEIGHT_PX,
+            fx: FOCAL_PX,
+            fy: FOCAL_PX,
+            cx: 0.5 * f64::from(WIDTH_PX),
+            cy: 0.5 * f64::from(HEIGHT_PX),
+        },
+        cam_from_map: Rigid::new(DQuat::IDENTITY, DVec3::ZERO),
+        depth: Some(Arc::new(depth)),
+    };
+    (splats, view)
+}

@@ -1,0 +1,47 @@
+//! pose_adam: gradient of a view's pose -> the pose after one update.
+//!
+//! Knows nothing of pictures. The delta is left-multiplied: `exp([rho; theta]) * cam_from_map`.
+
+use glam::DVec3;
+
+use crate::pose::Rigid;
+
+const BETA_1: f64 = 0.9;
+const BETA_2: f64 = 0.999;
+/// Larger than for splats: a view that sees next to nothing shall not run away on noise.
+const EPS: f64 = 1e-8;
+
+/// Adam's state of one view, in the tangent space at its pose.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PoseAdam {
+    first: [f64; 6],
+    second: [f64; 6],
+    age: u32,
+}
+
+impl PoseAdam {
+    /// `gradient` is (rho, theta), `rates` those of translation and rotation. `None`: the gradient is not finite.
+    pub fn update(&mut self, pose: &Rigid, gradient: [f64; 6], rates: [f32; 2]) -> Option<Rigid> {
+        if !gradient.iter().all(|g| g.is_finite()) {
+            return None;
+        }
+        self.age = self.age.saturating_add(1);
+        let unbias = [
+            1.0 - BETA_1.powf(f64::from(self.age)),
+            1.0 - BETA_2.powf(f64::from(self.age)),
+        ];
+        let delta: [f64; 6] = std::array::from_fn(|i| {
+            let g = gradient[i];
+            self.first[i] = BETA_1 * self.first[i] + (1.0 - BETA_1) * g;
+            self.second[i] = BETA_2 * self.second[i] + (1.0 - BETA_2) * g * g;
+            let direction = self.first[i] / unbias[0] / ((self.second[i] / unbias[1]).sqrt() + EPS);
+            -f64::from(rates[i / 3]) * direction
+        });
+        let [rho_x, rho_y, rho_z, theta_x, theta_y, theta_z] = delta;
+        let step = Rigid::exp(
+            DVec3::new(rho_x, rho_y, rho_z),
+            DVec3::new(theta_x, theta_y, theta_z),
+        );
+        Some((step * *pose).renormalized())
+    }
+}

@@ -1,0 +1,176 @@
+//! Every backend's pictures against the twin's.
+
+use splat_mapper::splat::Rendering;
+
+use crate::backends::BACKENDS;
+use crate::reference::hostile::{KINDS, camera};
+use crate::reference::random::Scene;
+use crate::reference::{Params, doubt, render};
+
+/// Half a step of an 8-bit picture: nobody sees less.
+const MAX_ERROR: f64 = 2e-3;
+/// Expected depth means little where next to nothing was hit.
+const MIN_DEPTH_ALPHA: f64 = 0.1;
+/// Share of pixels that may hang on a decision which f32 may take otherwise; these are held to bar plus doubt.
+const MAX_UNDECIDED: f64 = 0.005;
+/// The same where f32 itself is short of digits: covariances of needles, splats some 30 map units away.
+const MAX_UNDECIDED_OF: [(&str, f64); 2] = [("needles", 0.2), ("far from the origin", 0.03)];
+
+#[derive(Debug, Default, Clone, Copy)]
+struct Tally {
+    n_pixels: usize,
+    n_undecided: usize,
+    /// Over decided pixels: colour and alpha absolute, depth relative.
+    worst: [f64; 3],
+}
+
+impl Tally {
+    fn add(&mut self, other: &Self) {
+        self.n_pixels += other.n_pixels;
+        self.n_undecided += other.n_undecided;
+        for (worst, other) in self.worst.iter_mut().zip(other.worst) {
+            *worst = worst.max(other);
+        }
+    }
+}
+
+fn compare(scene: &Scene, rendering: &Rendering) -> Result<Tally, String> {
+    let (params, camera) = (Params::from(&scene.splats), camera(scene));
+    let twin = render(&params, &camera, 3);
+    let doubts = doubt::doubt(&params, &camera, 3);
+    let size = [
+        scene.view.intrinsics.width_px,
+        scene.view.intrinsics.height_px,
+    ];
+    let n = twin.alpha.len();
+    if [rendering.width_px, rendering.height_px] != size
+        || [
+            rendering.rgb.len(),
+            rendering.alpha.len(),
+            rendering.depth.len(),
+        ] != [3 * n, n, n]
+    {
+        return Err(format!(
+            "rendering of {}x{} where {size:?} was asked for",
+            rendering.width_px, rendering.height_px
+        ));
+    }
+    let mut tally = Tally {
+        n_pixels: n,
+        ..Tally::default()
+    };
+    for (pixel, doubt) in doubts.iter().enumerate() {
+        let mut errors = [(0.0, 0.0); 5];
+        for channel in 0..3 {
+            let at = 3 * pixel + channel;
+            errors[channel] = (
+                (f64::from(rendering.rgb[at]) - twin.rgb[at]).abs(),
+                doubt.rgb[channel],
+            );
+        }
+        errors[3] = (
+            (f64::from(rendering.alpha[pixel]) - twin.alpha[pixel]).abs(),
+            doubt.alpha,
+        );
+        if twin.alpha[pixel] > MIN_DEPTH_ALPHA {
+            let depth = twin.depth(pixel);
+            errors[4] = (
+                (f64::from(rendering.depth[pixel]) - depth).abs() / depth,
+                doubt.depth,
+            );
+        }
+        let is_undecided = errors.iter().any(|&(_, doubt)| doubt > 0.5 * MAX_ERROR);
+        tally.n_undecided += usize::from(is_undecided);
+        for (which, (error, doubt)) in errors.into_iter().enumerate() {
+            if error.is_nan() || error > MAX_ERROR + doubt {
+                let (x, y) = (pixel % size[0] as usize, pixel / size[0] as usize);
+                let what = ["r", "g", "b", "alpha", "depth"][which];
+                return Err(format!(
+                    "{what} at {x}, {y} is off by {error:.2e} where {doubt:.1e} is in doubt"
+                ));
+            }
+            if !is_undecided {
+                let group = [0, 0, 0, 1, 2][which];
+                tally.worst[group] = error.max(tally.worst[group]);
+            }
+        }
+    }
+    Ok(tally)
+}
+
+/// All kinds of scenes through one backend; says all kinds that fail.
+fn check(mut backend: impl FnMut(&Scene) -> Rendering) -> Result<Tally, String> {
+    let (mut total, mut failures) = (Tally::default(), String::new());
+    for (name, n, make) in KINDS {
+        let mut of_kind = Tally::default();
+        for seed in 0..n {
+            let scene = make(seed);
+            match compare(&scene, &backend(&scene)) {
+                Ok(tally) => of_kind.add(&tally),
+                Err(reason) => failures += &format!("{name}, seed {seed}: {reason}\n"),
+            }
+        }
+        let limit = MAX_UNDECIDED_OF
+            .iter()
+            .find(|(of, _)| *of == name)
+            .map_or(MAX_UNDECIDED, |&(_, limit)| limit);
+        if of_kind.n_undecided as f64 > limit * of_kind.n_pixels as f64 {
+            failures += &format!("{name}: too many pixels are undecided: {of_kind:?}\n");
+        }
+        eprintln!("{name}: {of_kind:?}");
+        total.add(&of_kind);
+    }
+    if failures.is_empty() {
+        Ok(total)
+    } else {
+        Err(failures)
+    }
+}
+
+/// The twin itself, rounded to f32: the best that a backend can be.
+fn rounded_twin(scene: &Scene) -> Rendering {
+    let raster = render(&Params::from(&scene.splats), &camera(scene), 3);
+    Rendering {
+        width_px: raster.width_px as u32,
+        height_px: raster.height_px as u32,
+        depth: (0..raster.alpha.len())
+            .map(|pixel| raster.depth(pixel) as f32)
+            .collect(),
+        rgb: raster.rgb.iter().map(|&value| value as f32).collect(),
+        alpha: raster.alpha.iter().map(|&value| value as f32).collect(),
+    }
+}
+
+#[test]
+fn every_backends_pictures_are_the_twins() {
+    for backend in BACKENDS {
+        if let Err(failures) = check(|scene| backend.render(scene)) {
+            panic!("{}:\n{failures}", backend.name);
+        }
+    }
+}
+
+#[test]
+fn few_pixels_hang_on_a_decision_that_rounding_may_turn() {
+    check(rounded_twin).unwrap();
+    assert_eq!(KINDS.iter().map(|kind| kind.1).sum::<u64>(), 200);
+}
+
+#[test]
+fn a_picture_that_is_off_by_three_thousandths_in_one_pixel_is_refused() {
+    let scene = (KINDS[0].2)(7);
+    let honest = rounded_twin(&scene);
+    compare(&scene, &honest).unwrap();
+    let brightest = (0..honest.alpha.len())
+        .max_by(|&a, &b| honest.alpha[a].total_cmp(&honest.alpha[b]))
+        .unwrap();
+    for which in 0..3 {
+        let mut wrong = honest.clone();
+        match which {
+            0 => wrong.rgb[3 * brightest + 1] += 3e-3,
+            1 => wrong.alpha[brightest] -= 3e-3,
+            _ => wrong.depth[brightest] *= 1.003,
+        }
+        assert!(compare(&scene, &wrong).is_err(), "{which}");
+    }
+}
