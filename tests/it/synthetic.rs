@@ -16,7 +16,7 @@ fn take(options: &str) -> Take {
     Take::new(SynthSettings::parse(options).unwrap()).unwrap()
 }
 
-fn colour(image: &RgbImage, pixel: DVec2) -> Option<DVec3> {
+pub fn colour(image: &RgbImage, pixel: DVec2) -> Option<DVec3> {
     let (width, height) = (image.width_px as usize, image.height_px as usize);
     let place = pixel - 0.5;
     if place.min_element() < 0.0 || place.x >= width as f64 - 1.0 || place.y >= height as f64 - 1.0

@@ -34,6 +34,7 @@ use crate::camera::{Intrinsics, Lens};
 use crate::config::SourceParams;
 use crate::frame::Frame;
 
+use super::rectify::Rectifier;
 use super::{Source, SourceCounts, SourceError};
 use take::Take;
 
@@ -137,7 +138,8 @@ pub struct SyntheticSource {
     take: Take,
     n_frames: u32,
     next_ix: u32,
-    rectify: bool,
+    /// Straightens the pictures of bent lenses.
+    rectifier: Option<Rectifier>,
 }
 
 impl SyntheticSource {
@@ -167,12 +169,19 @@ impl SyntheticSource {
             way_out: "for example synthetic:room?frames=60&lens=radial",
             path: PathBuf::from(scene),
         })?;
+        let lens = take.settings().lens();
+        let is_bent = !lens.distortion.is_none();
+        let rectifier = if is_bent && params.rectify {
+            Rectifier::new(&lens)
+        } else {
+            None
+        };
         let n_frames = take.settings().n_frames;
         Ok(Self {
             take,
             n_frames,
             next_ix: 0,
-            rectify: params.rectify,
+            rectifier,
         })
     }
 }
@@ -185,15 +194,13 @@ impl Source for SyntheticSource {
         }
         self.next_ix += 1;
         let lens = self.take.settings().lens();
-        let is_straight = self.take.settings().lens == LensKind::Pinhole;
-        let (image, intrinsics) = match is_straight || !self.rectify {
-            true => (
-                self.take.picture(ix),
-                is_straight.then_some(lens.intrinsics),
-            ),
-            false => (
-                take::rectified(&self.take.picture(ix), &lens),
-                Some(lens.intrinsics),
+        let picture = self.take.picture(ix);
+        let (image, intrinsics) = match &self.rectifier {
+            Some(rectifier) => (rectifier.rectify(picture), Some(rectifier.pinhole)),
+            // A bent picture fits no pinhole: whoever turned rectification off gets it uncalibrated.
+            None => (
+                picture,
+                lens.distortion.is_none().then_some(lens.intrinsics),
             ),
         };
         // Depth belongs to straight pictures; half their size is as fine as any model's.

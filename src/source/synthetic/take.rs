@@ -5,7 +5,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use glam::{DVec2, DVec3, Vec3};
+use glam::{DVec2, Vec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use rayon::prelude::*;
@@ -17,9 +17,7 @@ use crate::pose::Rigid;
 
 use super::geometry::Ray;
 use super::scene::Scene;
-use super::{
-    SceneKind, SynthError, SynthSettings, corridor, facade, lens, noise, room, trajectory,
-};
+use super::{SceneKind, SynthError, SynthSettings, corridor, facade, noise, room, trajectory};
 
 /// Header stamps start here and go on at 10 Hz.
 const START_SECS: i64 = 1_700_000_000;
@@ -124,15 +122,20 @@ impl Take {
             .enumerate()
             .for_each(|(y, row)| {
                 for (x, value) in row.iter_mut().enumerate() {
-                    let in_cam = lens::ray_in_cam(lens, DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
+                    let Some(in_cam) = lens.ray_in_cam(DVec2::new(x as f64 + 0.5, y as f64 + 0.5))
+                    else {
+                        continue;
+                    };
+                    let direction = pose.rotation * in_cam;
                     let ray = Ray {
                         origin: pose.translation,
-                        direction: pose.rotation * in_cam,
+                        direction,
                     };
+                    // The ray's third coordinate in the camera is 1, so its length counts depth.
                     *value = self
                         .scene
                         .meet(&ray, f64::MAX)
-                        .map_or(0.0, |hit| (hit.distance * in_cam.z) as f32);
+                        .map_or(0.0, |hit| hit.distance as f32);
                 }
             });
         let confidence = depth
@@ -172,10 +175,14 @@ impl Take {
         let corner = DVec2::new(x as f64, y as f64);
         let mut sum = Vec3::ZERO;
         for (place, pose) in samples {
-            let in_cam: DVec3 = lens::ray_in_cam(lens, corner + *place);
+            // Beyond the rim of a fisheye it is dark.
+            let Some(in_cam) = lens.ray_in_cam(corner + *place) else {
+                continue;
+            };
+            let direction = pose.rotation * in_cam.normalize();
             let ray = Ray {
                 origin: pose.translation,
-                direction: pose.rotation * in_cam,
+                direction,
             };
             // Sensors clip each sample's highlights before the eye would: bright lamps keep soft rims.
             sum += self.scene.radiance(&ray, pixel_angle).min(Vec3::splat(4.0));
@@ -219,42 +226,4 @@ fn expose(light: Vec3, noise: f32, random: &mut Pcg32) -> [u8; 3] {
 fn gaussian(random: &mut Pcg32) -> f32 {
     let radius = (-2.0 * (1.0 - random.random::<f32>()).ln()).sqrt();
     radius * (std::f32::consts::TAU * random.random::<f32>()).cos()
-}
-
-/// A distorted picture -> the pinhole picture of the same intrinsics, sampled bilinearly.
-pub(super) fn rectified(image: &RgbImage, lens: &Lens) -> RgbImage {
-    let (width, height) = (image.width_px as usize, image.height_px as usize);
-    let mut pixels = vec![0u8; image.pixels.len()];
-    pixels
-        .par_chunks_mut(3 * width)
-        .enumerate()
-        .for_each(|(y, row)| {
-            for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                let ray = lens
-                    .intrinsics
-                    .ray_in_cam(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
-                let Some(place) = lens::project(lens, ray) else {
-                    continue;
-                };
-                let place = (place - 0.5).clamp(
-                    DVec2::ZERO,
-                    DVec2::new(width as f64 - 1.0, height as f64 - 1.0),
-                );
-                let (left, top) = (place.x as usize, place.y as usize);
-                let (right, bottom) = ((left + 1).min(width - 1), (top + 1).min(height - 1));
-                let (u, v) = (place.x.fract(), place.y.fract());
-                for (channel, value) in pixel.iter_mut().enumerate() {
-                    let at =
-                        |x: usize, y: usize| f64::from(image.pixels[3 * (y * width + x) + channel]);
-                    let above = at(left, top) * (1.0 - u) + at(right, top) * u;
-                    let below = at(left, bottom) * (1.0 - u) + at(right, bottom) * u;
-                    *value = (above * (1.0 - v) + below * v).round() as u8;
-                }
-            }
-        });
-    RgbImage {
-        width_px: image.width_px,
-        height_px: image.height_px,
-        pixels,
-    }
 }
