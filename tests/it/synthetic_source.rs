@@ -232,7 +232,7 @@ fn check_messages<'a>(settings: &SynthSettings, payload: impl Fn(usize, usize) -
             depth.step,
             depth.encoding.as_str()
         ),
-        (40, 30, 80, "16UC1")
+        (32, 24, 64, "16UC1")
     );
     let picture: CompressedImage = ros::decode(payload(2, 4)).unwrap();
     let decoded = image::load_from_memory(&picture.data).unwrap().to_rgb8();
@@ -280,7 +280,7 @@ fn recorded_depth_is_exact_to_half_a_millimetre() {
         ros::decode(&topics["/camera/depth sensor_msgs/msg/Image"][1].1).unwrap();
     let exact = Take::new(settings.clone())
         .unwrap()
-        .depth(1, &settings.lens().intrinsics.resized(80, 60));
+        .depth(1, &settings.lens().intrinsics.resized(64, 48));
     let recorded = depth
         .data
         .chunks(2)

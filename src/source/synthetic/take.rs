@@ -30,6 +30,11 @@ const STILL: [[f64; 2]; 4] = [
     [0.625, 0.875],
     [0.875, 0.375],
 ];
+/// Width of a sample, for what texture it can show.
+const SAMPLE_PX: f64 = 1.0;
+/// Side of the square that the samples of a pixel are spread over: what lens and demosaicing smear. Sharper pictures
+/// are all grain, which neither JPEG nor splats can hold.
+const SPREAD_PX: f64 = 1.5;
 /// Samples along a motion streak; streaks are up to some 15 px long.
 const N_BLURRED: usize = 12;
 
@@ -171,12 +176,12 @@ impl Take {
     }
 
     fn pixel_light(&self, lens: &Lens, samples: &[(DVec2, Rigid)], [x, y]: [usize; 2]) -> Vec3 {
-        let pixel_angle = 0.8 / lens.intrinsics.fx;
+        let pixel_angle = SAMPLE_PX / lens.intrinsics.fx;
         let corner = DVec2::new(x as f64, y as f64);
         let mut sum = Vec3::ZERO;
         for (place, pose) in samples {
             // Beyond the rim of a fisheye it is dark.
-            let Some(in_cam) = lens.ray_in_cam(corner + *place) else {
+            let Some(in_cam) = lens.ray_in_cam(corner + 0.5 + (*place - 0.5) * SPREAD_PX) else {
                 continue;
             };
             let direction = pose.rotation * in_cam.normalize();
