@@ -83,13 +83,6 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
-        Some(("v4l2" | "webcam", _)) => {
-            not_in_build("record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH")
-        }
-        Some(("ros2" | "zenoh", _)) => {
-            not_in_build("record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH")
-        }
-        Some(("synthetic", scene)) => open_synthetic(uri, scene, params, seed),
         Some(("v4l2" | "webcam", _)) => not_in_build(
             "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
         ),
@@ -108,17 +101,14 @@ fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, So
     Ok(Box::new(images::ImagesSource::open(path, params)?))
 }
 
-fn open_synthetic(scene: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
-    Ok(Box::new(synthetic::SyntheticSource::open(scene, params, seed)?))
 fn open_synthetic(
-    uri: &str,
-    _scene: &str,
-    _params: &SourceParams,
-    _seed: u64,
+    scene: &str,
+    params: &SourceParams,
+    seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
-    Err(SourceError::Uri {
-        uri: uri.to_owned(),
-    })
+    Ok(Box::new(synthetic::SyntheticSource::open(
+        scene, params, seed,
+    )?))
 }
 
 /// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.
