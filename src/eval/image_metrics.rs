@@ -119,9 +119,7 @@ mod tests {
             .map(|ix| (0.7 * noise(ix, 0.618_034) + 0.5 * noise(ix / 40, 0.414_214) - 0.1) as f32)
             .collect();
         let pixels = (0..n)
-            .map(|ix| {
-                (255.0 * (0.6 * noise(ix, 0.618_034) + 0.4 * noise(ix / 40, 0.414_214))) as u8
-            })
+            .map(|ix| (255.0 * (0.35 * noise(ix, 0.618_034) + 0.65 * noise(ix, 0.732_051))) as u8)
             .collect();
         (
             rendered,
