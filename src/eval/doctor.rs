@@ -393,7 +393,6 @@ mod tests {
         for check in &checks {
             assert_eq!(check.state == State::Ok, check.fix.is_none(), "{check:?}");
         }
-        std::fs::write("/tmp/eval_doctor.txt", format_checks(&checks)).unwrap();
         assert!(format_checks(&checks).lines().count() > checks.len());
     }
 }
