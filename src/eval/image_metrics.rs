@@ -54,12 +54,14 @@ fn channel_ssim(rendered: &[f32], photo: &RgbImage, channel: usize, window: &[f6
     let across: Vec<[f64; 5]> = (0..height)
         .into_par_iter()
         .flat_map_iter(|row| {
-            let pixel = move |col: usize| {
-                let ix = 3 * (row * width + col) + channel;
-                let (x, y) = (shown(rendered[ix]), f64::from(photo.pixels[ix]) / 255.0);
-                [x, y, x * x, y * y, x * y]
-            };
-            (0..n_cols).map(move |col| weighted(window, |tap| pixel(col + tap)))
+            let pixels: Vec<[f64; 5]> = (row * width..(row + 1) * width)
+                .map(|pixel_ix| {
+                    let ix = 3 * pixel_ix + channel;
+                    let (x, y) = (shown(rendered[ix]), f64::from(photo.pixels[ix]) / 255.0);
+                    [x, y, x * x, y * y, x * y]
+                })
+                .collect();
+            (0..n_cols).map(move |col| weighted(window, |tap| pixels[col + tap]))
         })
         .collect();
     let rows: Vec<f64> = (0..n_rows)
