@@ -181,7 +181,8 @@ fn parse_line(content: &str) -> Result<TimedPose, &'static str> {
         let word = words.next().ok_or("it has fewer than eight numbers")?;
         *number = word
             .parse()
-            .map_err(|_| "it holds something that is no number")?;
+            .ok()
+            .ok_or("it holds something that is no number")?;
     }
     if words.next().is_some() {
         return Err("it has more than eight numbers");
@@ -251,7 +252,7 @@ mod tests {
     #[test]
     fn stamps_are_read_to_the_nanosecond() {
         let check = |word: &str, nanos: Option<i64>| {
-            assert_eq!(parse_stamp(word).map(|s| s.nanos), nanos, "{word}")
+            assert_eq!(parse_stamp(word).map(|s| s.nanos), nanos, "{word}");
         };
         check("1403715273.262142976", Some(1_403_715_273_262_142_976));
         check("0.1", Some(100_000_000));
