@@ -54,7 +54,7 @@ pub(crate) fn keyframe(
         truth: None,
         truth_depth: None,
     };
-    Arc::new(Keyframe { id, frame })
+    Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
 }
 
 pub(crate) fn intrinsics(folder: &Path) -> Intrinsics {

@@ -5,6 +5,7 @@
 
 mod adjusting;
 mod calibrating;
+mod dense;
 mod landmarks;
 mod links;
 mod merging;
@@ -12,6 +13,8 @@ mod placing;
 mod report;
 mod scene;
 mod starting;
+#[cfg(test)]
+mod tests;
 
 use std::sync::Arc;
 
@@ -19,6 +22,7 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
+use self::dense::Dense;
 use self::links::{link_alike, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
@@ -27,9 +31,9 @@ use self::scene::{NONE, Scene, Shot};
 use self::starting::{Start, start};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, SfmParams};
-use crate::frame::{Batch, DepthMap, Keyframe};
-use crate::geometry::features::{features, working_picture, working_size};
-use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, View};
+use crate::frame::{Batch, Keyframe};
+use crate::geometry::features::{Features, features, working_picture, working_size};
+use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
@@ -51,7 +55,7 @@ pub(crate) struct Limits {
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
-    mvs: MvsParams,
+    dense: Dense,
     seed: u64,
     scene: Scene,
     told: Told,
@@ -63,7 +67,7 @@ impl Sfm {
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
         Self {
             sfm: sfm.clone(),
-            mvs: mvs.clone(),
+            dense: Dense::new(mvs),
             seed,
             scene: Scene::default(),
             told: Told::default(),
@@ -135,7 +139,12 @@ impl Sfm {
         let image = &keyframe.frame.image;
         let picture = working_picture(image, self.sfm.max_side);
         let found = features(&picture, self.sfm.max_features);
-        let (w, h) = (picture.width as u32, picture.height as u32);
+        self.push(keyframe, found, (picture.width as u32, picture.height as u32));
+    }
+
+    /// Adds a shot whose features are given in a working picture of that size.
+    fn push(&mut self, keyframe: &Arc<Keyframe>, found: Features, (w, h): (u32, u32)) {
+        let image = &keyframe.frame.image;
         let known = keyframe.frame.intrinsics.filter(Intrinsics::is_plausible);
         let lens = known.unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px)).resized(w, h);
         self.scene.shots.push(Shot {
@@ -202,34 +211,16 @@ impl Sfm {
             }
         }
     }
-
-    fn densify(&self, sparse: SparseBatch) -> GeometryBatch {
-        let views = sparse.views.into_iter().map(|view| View {
-            keyframe_id: view.keyframe_id,
-            component: view.component,
-            intrinsics: view.intrinsics,
-            batch_from_cam: view.batch_from_cam,
-            depth: self.depth(&view),
-            health: view.health,
-        });
-        GeometryBatch { batch_id: sparse.batch_id, views: views.collect(), revised: sparse.revised, note: sparse.note }
-    }
-
-    fn depth(&self, view: &SparseView) -> DepthMap {
-        let (w, h) = working_size(view.intrinsics.width_px, view.intrinsics.height_px, self.mvs.max_side);
-        let n = w as usize * h as usize;
-        DepthMap { width_px: w, height_px: h, depth: vec![0.0; n], confidence: vec![0.0; n] }
-    }
 }
 
 impl GeometryModel for Sfm {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.sparse(batch);
-        Ok(self.densify(sparse))
+        Ok(self.dense.densify(&self.scene, sparse))
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.finish_sparse();
-        Ok(self.densify(sparse))
+        Ok(self.dense.densify(&self.scene, sparse))
     }
 }

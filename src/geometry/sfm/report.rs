@@ -117,10 +117,6 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     let shot = &scene.shots[shot_ix];
     let placed = shot.placed.as_ref()?;
     let image = &shot.keyframe.frame.image;
-    let intrinsics = match shot.keyframe.frame.intrinsics {
-        Some(known) => known,
-        None => shot.lens.resized(image.width_px, image.height_px),
-    };
     let to_picture = DVec2::new(
         f64::from(image.width_px) / f64::from(shot.lens.width_px),
         f64::from(image.height_px) / f64::from(shot.lens.height_px),
@@ -141,7 +137,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     Some(SparseView {
         keyframe_id: shot.keyframe.id,
         component: placed.component,
-        intrinsics,
+        intrinsics: scene.intrinsics_of(shot.keyframe.id)?,
         batch_from_cam: placed.cam_from_map.inverse(),
         health,
         landmarks,

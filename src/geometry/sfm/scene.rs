@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 
 use crate::camera::Intrinsics;
-use crate::frame::Keyframe;
+use crate::frame::{Keyframe, RgbImage};
 use crate::geometry::features::Features;
 use crate::geometry::matching::Wide;
 use crate::geometry::triangulate::Sight;
@@ -82,6 +82,18 @@ impl Scene {
         let shot = &self.shots[at.0 as usize];
         let placed = shot.placed.as_ref()?;
         Some(Sight { cam_from_map: &placed.cam_from_map, intrinsics: &shot.lens, pixel: self.pixel(at) })
+    }
+
+    /// Intrinsics at the size of the keyframe's picture.
+    pub(super) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
+        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        let frame = &shot.keyframe.frame;
+        Some(frame.intrinsics.unwrap_or_else(|| shot.lens.resized(frame.image.width_px, frame.image.height_px)))
+    }
+
+    pub(super) fn image_of(&self, keyframe_id: u32) -> Option<Arc<RgbImage>> {
+        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        Some(Arc::clone(&shot.keyframe.frame.image))
     }
 
     pub(super) fn component_of(&self, shot_ix: usize) -> Option<u32> {
