@@ -158,8 +158,20 @@ fn row(problem: &Problem, rotations: &[DMat3], point: DVec3, seen: &Observation,
     let (x, y, iz) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
     let (fx, fy) = (w * camera.intrinsics.fx, w * camera.intrinsics.fy);
     let by_camera = SMatrix::<f64, 2, PARAMS>::from_row_slice(&[
-        fx * iz, 0.0, -fx * x * iz, -fx * x * y, fx * (1.0 + x * x), -fx * y, fx * x,
-        0.0, fy * iz, -fy * y * iz, -fy * (1.0 + y * y), fy * x * y, fy * x, fy * y,
+        fx * iz,
+        0.0,
+        -fx * x * iz,
+        -fx * x * y,
+        fx * (1.0 + x * x),
+        -fx * y,
+        fx * x,
+        0.0,
+        fy * iz,
+        -fy * y * iz,
+        -fy * (1.0 + y * y),
+        fy * x * y,
+        fy * x,
+        fy * y,
     ]);
     let turn = rotations[seen.camera_ix].transpose();
     let (du, dv) = (turn * DVec3::new(fx * iz, 0.0, -fx * x * iz), turn * DVec3::new(0.0, fy * iz, -fy * y * iz));
@@ -205,7 +217,13 @@ fn damped(v: &Matrix3<f64>, damping: f64) -> Option<Matrix3<f64>> {
 }
 
 /// Adds one point's share to the lower triangle of the reduced system.
-fn eliminate(problem: &Problem, layout: &Layout, block: &PointBlock, damping: f64, (s, b): (&mut DMatrix<f64>, &mut DVector<f64>)) {
+fn eliminate(
+    problem: &Problem,
+    layout: &Layout,
+    block: &PointBlock,
+    damping: f64,
+    (s, b): (&mut DMatrix<f64>, &mut DVector<f64>),
+) {
     let Some(inverse) = damped(&block.v, damping) else { return };
     let cross: Vec<SMatrix<f64, PARAMS, 3>> = block.rows.iter().map(|r| r.by_camera.transpose() * r.by_point).collect();
     let columns: Vec<[Option<usize>; PARAMS]> = block
@@ -238,7 +256,12 @@ fn eliminate(problem: &Problem, layout: &Layout, block: &PointBlock, damping: f6
     }
 }
 
-fn add(s: &mut DMatrix<f64>, rows: &[Option<usize>; PARAMS], columns: &[Option<usize>; PARAMS], values: &SMatrix<f64, PARAMS, PARAMS>) {
+fn add(
+    s: &mut DMatrix<f64>,
+    rows: &[Option<usize>; PARAMS],
+    columns: &[Option<usize>; PARAMS],
+    values: &SMatrix<f64, PARAMS, PARAMS>,
+) {
     for (c, column) in columns.iter().enumerate() {
         let Some(column) = column else { continue };
         for (r, row) in rows.iter().enumerate() {
@@ -254,7 +277,10 @@ fn apply(problem: &Problem, layout: &Layout, normal: &Normal, delta: &DVector<f6
     let focal_step = layout.focal.map_or(0.0, |i| delta[i].clamp(-0.3, 0.3));
     for (camera, offset) in out.cameras.iter_mut().zip(&layout.offset) {
         if let Some(at) = *offset {
-            let (rho, theta) = (DVec3::new(delta[at], delta[at + 1], delta[at + 2]), DVec3::new(delta[at + 3], delta[at + 4], delta[at + 5]));
+            let (rho, theta) = (
+                DVec3::new(delta[at], delta[at + 1], delta[at + 2]),
+                DVec3::new(delta[at + 3], delta[at + 4], delta[at + 5]),
+            );
             camera.cam_from_map = (Rigid::exp(rho, theta) * camera.cam_from_map).renormalized();
         }
         if camera.shares_focal {
@@ -296,96 +322,4 @@ fn total_cost(problem: &Problem, loss_px: f64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use rand::{RngExt, SeedableRng};
-    use rand_pcg::Pcg32;
-
-    use super::*;
-
-    fn vector(rng: &mut Pcg32, size: f64) -> DVec3 {
-        DVec3::from_array([(); 3].map(|()| rng.random_range(-size..size)))
-    }
-
-    /// Six cameras round 120 points, exact but for noise; the share `wrong` of the pixels is anywhere.
-    fn problem(noise_px: f64, wrong: f64) -> Problem {
-        let mut rng = Pcg32::seed_from_u64(11);
-        let intrinsics = Intrinsics { width_px: 640, height_px: 480, fx: 500.0, fy: 505.0, cx: 320.0, cy: 240.0 };
-        let cameras: Vec<Camera> = (0..6)
-            .map(|i| {
-                let pose = Rigid::exp(vector(&mut rng, 0.8) + DVec3::Z * 5.0, vector(&mut rng, 0.3));
-                Camera { cam_from_map: pose, intrinsics, is_fixed: i < 2, shares_focal: true }
-            })
-            .collect();
-        let points: Vec<DVec3> = (0..120).map(|_| vector(&mut rng, 1.5)).collect();
-        let mut observations = Vec::new();
-        for point in &points {
-            let mut seen = Vec::new();
-            for (camera_ix, camera) in cameras.iter().enumerate() {
-                let exact = intrinsics.project(camera.cam_from_map.transform_point(*point)).unwrap();
-                let off = vector(&mut rng, 1.0).truncate() * if rng.random_range(0.0..1.0) < wrong { 80.0 } else { noise_px };
-                seen.push(Observation { camera_ix, pixel: exact + off });
-            }
-            observations.push(seen);
-        }
-        Problem { cameras, points, observations }
-    }
-
-    fn disturbed(truth: &Problem, focal: f64) -> Problem {
-        let mut rng = Pcg32::seed_from_u64(12);
-        let mut out = truth.clone();
-        for camera in &mut out.cameras {
-            camera.intrinsics.fx *= focal;
-            camera.intrinsics.fy *= focal;
-            if !camera.is_fixed {
-                camera.cam_from_map = Rigid::exp(vector(&mut rng, 0.05), vector(&mut rng, 0.02)) * camera.cam_from_map;
-            }
-        }
-        out.points.iter_mut().for_each(|p| *p += vector(&mut rng, 0.05));
-        out
-    }
-
-    fn worst_pose(a: &Problem, b: &Problem) -> f64 {
-        let off = |(a, b): (&Camera, &Camera)| {
-            a.cam_from_map.angle_to(&b.cam_from_map) + a.cam_from_map.translation.distance(b.cam_from_map.translation)
-        };
-        a.cameras.iter().zip(&b.cameras).map(off).fold(0.0, f64::max)
-    }
-
-    #[test]
-    fn exact_pixels_give_back_exact_poses_and_points() {
-        let truth = problem(0.0, 0.0);
-        let mut found = disturbed(&truth, 1.0);
-        let report = adjust(&mut found, &Settings { max_steps: 60, loss_px: 5.0, refine_focal: false });
-        assert!(report.cost_after < 1e-6 * report.cost_before, "{report:?}");
-        assert!(worst_pose(&truth, &found) < 1e-5, "{}", worst_pose(&truth, &found));
-        let off = truth.points.iter().zip(&found.points).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
-        assert!(off < 1e-4, "{off}");
-    }
-
-    #[test]
-    fn a_wrong_focal_length_is_corrected() {
-        let truth = problem(0.0, 0.0);
-        let mut found = disturbed(&truth, 1.15);
-        adjust(&mut found, &Settings { max_steps: 100, loss_px: 20.0, refine_focal: true });
-        let focal = found.cameras[0].intrinsics;
-        assert!((focal.fx / 500.0 - 1.0).abs() < 1e-3 && (focal.fy / 505.0 - 1.0).abs() < 1e-3, "{focal:?}");
-    }
-
-    #[test]
-    fn one_pixel_in_twelve_may_be_anywhere() {
-        let truth = problem(0.3, 0.08);
-        let mut found = disturbed(&truth, 1.0);
-        adjust(&mut found, &Settings { max_steps: 60, loss_px: 1.0, refine_focal: false });
-        assert!(worst_pose(&truth, &found) < 5e-3, "{}", worst_pose(&truth, &found));
-    }
-
-    #[test]
-    fn nothing_to_move_is_no_fault() {
-        let mut empty = Problem::default();
-        adjust(&mut empty, &Settings { max_steps: 5, loss_px: 1.0, refine_focal: true });
-        let mut held = problem(0.5, 0.0);
-        held.cameras.iter_mut().for_each(|c| c.is_fixed = true);
-        let report = adjust(&mut held, &Settings { max_steps: 20, loss_px: 1.0, refine_focal: false });
-        assert!(report.cost_after <= report.cost_before);
-    }
-}
+mod tests;

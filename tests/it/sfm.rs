@@ -122,11 +122,8 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let secs = watch.secs();
     let components: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
     let largest = components.iter().max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
-    let pairs: Vec<(Rigid, Rigid)> = poses
-        .iter()
-        .filter(|(_, p)| Some(&p.0) == largest)
-        .map(|(id, p)| (shown.truth[*id as usize], p.1))
-        .collect();
+    let pairs: Vec<(Rigid, Rigid)> =
+        poses.iter().filter(|(_, p)| Some(&p.0) == largest).map(|(id, p)| (shown.truth[*id as usize], p.1)).collect();
     let (ate_percent, rotation_deg) = errors(&pairs);
     Figures {
         registered: pairs.len(),

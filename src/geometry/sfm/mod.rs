@@ -18,6 +18,8 @@ mod tests;
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
@@ -39,6 +41,8 @@ use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 const ERROR_SIDE_PX: f64 = 640.0;
 /// Keyframes that a component beside the first one needs; less is likelier a mistake than a place.
 const MIN_NEW_COMPONENT: usize = 4;
+/// Waiting keyframes that are tried with every batch, the newest; all others once more at the end.
+const MAX_WAITING: usize = 64;
 /// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
 const FIRST_FOCAL: f64 = 0.9;
 
@@ -80,13 +84,19 @@ impl Sfm {
     pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
         let limits = self.limits(&batch.keyframes);
-        for keyframe in &batch.keyframes {
-            if self.shot_of(keyframe.id).is_none() {
-                self.add(keyframe);
-                link_newest(&mut self.scene, limits.max_error_px, self.seed);
-            }
+        let fresh: Vec<&Arc<Keyframe>> = batch.keyframes.iter().filter(|k| self.shot_of(k.id).is_none()).collect();
+        let looked = |keyframe: &&Arc<Keyframe>| {
+            let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
+            (features(&picture, self.sfm.max_features), (picture.width as u32, picture.height as u32))
+        };
+        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
+        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
+            self.push(keyframe, features, size);
+            link_newest(&mut self.scene, limits.max_error_px, self.seed);
         }
-        self.place_waiting(&limits, MIN_NEW_COMPONENT);
+        let waiting = self.waiting();
+        let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
+        self.place_waiting(newest, &limits, MIN_NEW_COMPONENT);
         self.adjust_grown(&limits);
         let shared: Vec<usize> =
             batch.keyframes.iter().take(batch.n_shared).filter_map(|k| self.shot_of(k.id)).collect();
@@ -97,12 +107,12 @@ impl Sfm {
     pub fn finish_sparse(&mut self) -> SparseBatch {
         let keyframes: Vec<Arc<Keyframe>> = self.scene.shots.iter().map(|s| Arc::clone(&s.keyframe)).collect();
         let limits = self.limits(&keyframes);
-        let waiting: Vec<usize> = (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect();
+        let waiting = self.waiting();
         for &shot in &waiting {
             self.scene.shots[shot].failed_with = 0;
             link_alike(&mut self.scene, shot, limits.max_error_px, self.seed);
         }
-        self.place_waiting(&limits, 3);
+        self.place_waiting(&waiting, &limits, 3);
         for component in 0..self.scene.components.len() as u32 {
             adjust_global(&mut self.scene, component, limits.max_error_px, 30);
         }
@@ -133,13 +143,6 @@ impl Sfm {
     fn shot_of(&self, keyframe_id: u32) -> Option<usize> {
         // The newest are asked for most.
         self.scene.shots.iter().rposition(|s| s.keyframe.id == keyframe_id)
-    }
-
-    fn add(&mut self, keyframe: &Arc<Keyframe>) {
-        let image = &keyframe.frame.image;
-        let picture = working_picture(image, self.sfm.max_side);
-        let found = features(&picture, self.sfm.max_features);
-        self.push(keyframe, found, (picture.width as u32, picture.height as u32));
     }
 
     /// Adds a shot whose features are given in a working picture of that size.
@@ -188,17 +191,20 @@ impl Sfm {
         Some(start_uncalibrated(&mut self.scene, pool, guess, limits))
     }
 
-    fn place_waiting(&mut self, limits: &Limits, min_shots: usize) {
-        let pool: Vec<usize> = (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect();
-        grow(&mut self.scene, &pool, limits);
-        while let Some(outcome) = self.try_start(&pool, min_shots, limits) {
+    fn waiting(&self) -> Vec<usize> {
+        (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect()
+    }
+
+    fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_shots: usize) {
+        grow(&mut self.scene, pool, limits);
+        while let Some(outcome) = self.try_start(pool, min_shots, limits) {
             self.last_start = Some(outcome);
             if outcome != Start::Started {
                 break;
             }
         }
         while merge(&mut self.scene, limits) {
-            grow(&mut self.scene, &pool, limits);
+            grow(&mut self.scene, pool, limits);
         }
     }
 

@@ -101,7 +101,8 @@ pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
     }
     let n_components = scene.components.iter().filter(|c| !c.shots.is_empty()).count();
     if waiting.is_empty() {
-        return (n_components > 1).then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
+        return (n_components > 1)
+            .then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
     }
     let shown: Vec<String> = waiting.iter().take(10).map(u32::to_string).collect();
     let more = if waiting.len() > 10 { ", ..." } else { "" };

@@ -109,6 +109,16 @@ impl Scene {
         self.components[component as usize].shots.push(shot_ix);
     }
 
+    /// The shot waits again; its sights go.
+    pub(super) fn unplace(&mut self, shot_ix: usize) {
+        for landmark in self.landmarks_of(&[shot_ix]) {
+            self.retain_sights(landmark, |s| s.0 as usize != shot_ix);
+        }
+        if let Some(placed) = self.shots[shot_ix].placed.take() {
+            self.components[placed.component as usize].shots.retain(|&s| s != shot_ix);
+        }
+    }
+
     pub(super) fn add_landmark(&mut self, point: DVec3, component: u32, seen: Vec<(u32, u32)>) -> u32 {
         let ix = self.landmarks.len() as u32;
         for &(shot, feature) in &seen {

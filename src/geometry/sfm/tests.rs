@@ -76,7 +76,8 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
         let limits = sfm.limits(&[]);
         link_newest(&mut sfm.scene, limits.max_error_px, 1);
         if id % 6 == 5 {
-            sfm.place_waiting(&limits, MIN_NEW_COMPONENT);
+            let waiting = sfm.waiting();
+            sfm.place_waiting(&waiting, &limits, MIN_NEW_COMPONENT);
         }
     }
     let out = sfm.finish_sparse();
@@ -149,7 +150,8 @@ fn two_parts_become_one_when_a_bridge_comes() {
         let side = if rng.random_range(0..2) == 0 { -4.0 } else { 4.0 };
         DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::new(side, 0.0, 8.0)
     });
-    let near = |x: f64, i: usize| Rigid::new(DQuat::IDENTITY, DVec3::new(x + 0.4 * i as f64 - 1.0, 0.2 * (i % 2) as f64, 1.5));
+    let near =
+        |x: f64, i: usize| Rigid::new(DQuat::IDENTITY, DVec3::new(x + 0.4 * i as f64 - 1.0, 0.2 * (i % 2) as f64, 1.5));
     let mut poses: Vec<Rigid> = (0..6).map(|i| near(-4.0, i)).chain((0..6).map(|i| near(4.0, i))).collect();
     let (_, apart) = run(&mut world, &poses, Some(camera()));
     let parts: std::collections::BTreeSet<u32> = apart.views.iter().map(|v| v.component).collect();
@@ -176,7 +178,14 @@ fn blank_tiny_and_broken_pictures_are_survived() {
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
     let picture = |id: u32, width_px: u32, height_px: u32, n: usize| {
         let image = Arc::new(RgbImage { width_px, height_px, pixels: vec![90; n] });
-        let frame = Frame { seq: 0, stamp: Stamp::from_secs(f64::from(id)), image, intrinsics: None, truth: None, truth_depth: None };
+        let frame = Frame {
+            seq: 0,
+            stamp: Stamp::from_secs(f64::from(id)),
+            image,
+            intrinsics: None,
+            truth: None,
+            truth_depth: None,
+        };
         Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
     };
     let keyframes =
