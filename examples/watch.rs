@@ -95,7 +95,8 @@ fn main() -> Result<()> {
         }
         let one = live.recv_timeout(Duration::from_millis(500)).map_err(|e| anyhow!("zenoh ended: {e}"))?;
         samples.extend(one);
-        for snapshot in samples.iter().filter_map(|sample| watch.take(sample)) {
+        let snapshots: Vec<Snapshot> = samples.iter().filter_map(|sample| watch.take(sample)).collect();
+        for snapshot in snapshots {
             let (map, sha) = (&snapshot.splats, layout::map_sha256(&snapshot.splats));
             println!(
                 "revision {} epoch {}: {} splats, {} keyframes, sha256 {sha}",

@@ -168,7 +168,10 @@ fn read_header(file: &mut impl BufRead) -> io::Result<Result<(Vec<String>, u64),
         // Comments may be in any encoding; what matters is plain ASCII.
         let text = String::from_utf8_lossy(&line).trim_end().to_owned();
         if lines.is_empty() && text != "ply" {
-            return Ok(Err(format!("it begins with {:?}, expected \"ply\"", text.chars().take(16).collect::<String>())));
+            return Ok(Err(format!(
+                "it begins with {:?}, expected \"ply\"",
+                text.chars().take(16).collect::<String>()
+            )));
         }
         if text == "end_header" {
             return Ok(Ok((lines, n_bytes)));
@@ -186,7 +189,7 @@ fn parse_header(lines: &[String]) -> Result<Table, String> {
             ["format", "binary_little_endian", "1.0"] => format_is_known = true,
             ["format", ..] => return Err(format!("{line:?}, expected binary_little_endian 1.0")),
             ["element", "vertex", count] if table.is_none() => {
-                let n_vertices = count.parse().map_err(|_| format!("{line:?} counts nothing"))?;
+                let n_vertices = count.parse().map_err(|e| format!("{line:?} counts nothing: {e}"))?;
                 table = Some(Table { n_vertices, properties: Vec::new() });
             }
             // Whatever stands behind the vertices is no splat.

@@ -231,7 +231,7 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
         };
         Ok((meta, rest.read_u8()?))
     };
-    let (meta, code) = parse().map_err(|_| format!("{} bytes are too few", content.len()))?;
+    let (meta, code) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
     let scale = ScaleSource::from_code(code).ok_or_else(|| format!("scale source {code} is unknown"))?;
     Ok(Meta { scale, ..meta })
 }

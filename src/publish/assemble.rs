@@ -128,7 +128,7 @@ impl Assembler {
             && chunk.chunk_ix < shape.n_chunks
             && chunk.first_splat < shape.n_splats
             && crc32c::crc32c(&chunk.data) == chunk.crc32c;
-        self.add(identity, is_sound.then_some(n_bytes + KEEP_BYTES), |open| {
+        self.add(&identity, is_sound.then_some(n_bytes + KEEP_BYTES), |open| {
             if !open.takes(&shape) {
                 return Outcome::Rejected;
             }
@@ -153,7 +153,7 @@ impl Assembler {
         let is_sound = shape.sh_degree <= layout::MAX_SH_DEGREE
             && shape.n_chunks <= shape.n_splats
             && (shape.n_chunks == 0) == (shape.n_splats == 0);
-        self.add(identity, (is_sound && scale.is_some()).then_some(KEEP_BYTES), |open| {
+        self.add(&identity, (is_sound && scale.is_some()).then_some(KEEP_BYTES), |open| {
             if !open.takes(&shape) {
                 return Outcome::Rejected;
             }
@@ -170,7 +170,7 @@ impl Assembler {
         let identity = Identity { map_id: array.map_id, epoch: array.epoch, revision: array.revision };
         let poses: Option<Vec<KeyframePose>> = array.keyframes.iter().map(|pose| pose.to_pose()).collect();
         let n_bytes = poses.as_ref().map(|poses| size_of_val(&poses[..]) + KEEP_BYTES);
-        self.add(identity, n_bytes, |open| {
+        self.add(&identity, n_bytes, |open| {
             if open.keyframes.contains_key(&array.first_ix) {
                 return Outcome::Superfluous;
             }
@@ -196,7 +196,7 @@ impl Assembler {
     /// `n_bytes` is `None` for a message that is unsound by itself.
     fn add(
         &mut self,
-        identity: Identity,
+        identity: &Identity,
         n_bytes: Option<usize>,
         apply: impl FnOnce(&mut Open) -> Outcome,
     ) -> Option<Snapshot> {
@@ -205,11 +205,11 @@ impl Assembler {
             self.counts.rejected += 1;
             return None;
         };
-        if !self.is_newer(&identity) {
+        if !self.is_newer(identity) {
             self.counts.superfluous += 1;
             return None;
         }
-        let open_ix = self.open_ix(&identity);
+        let open_ix = self.open_ix(identity);
         match apply(&mut self.open[open_ix]) {
             Outcome::Superfluous => self.counts.superfluous += 1,
             Outcome::Rejected => self.counts.rejected += 1,

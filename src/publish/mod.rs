@@ -16,7 +16,7 @@ pub mod zenoh;
 #[derive(Debug, thiserror::Error)]
 pub enum PublishError {
     #[error("parameter publish.{name} = {found:?} is of no use, expected {expected}")]
-    Param { name: &'static str, found: String, expected: &'static str },
+    Param { name: &'static str, found: String, expected: String },
     #[error("parameter publish.zenoh_config: {reason}: {}", path.display())]
     Config { reason: String, path: PathBuf },
     #[error("cannot open zenoh on {endpoints}: {reason}; check publish.zenoh_listen and publish.zenoh_connect")]
@@ -27,6 +27,6 @@ pub enum PublishError {
     Send { key: String, reason: String },
     #[error(transparent)]
     Encode(#[from] CdrError),
-    #[error("zenoh did not close within {waited_secs} s; its threads are left behind")]
+    #[error("zenoh did not close within {waited_secs} s, most likely over a stalled peer; its threads are left behind")]
     Close { waited_secs: f64 },
 }

@@ -26,7 +26,7 @@ use crate::ros::{Message, PoseStamped};
 
 /// A peer that takes in nothing for so long while we wait is cut off; it may connect again.
 const MAX_BLOCKED: Duration = Duration::from_secs(2);
-/// `close` waits no longer.
+/// `close` waits no longer. zenoh itself lingers ten seconds over bytes that a stalled peer never takes.
 const MAX_CLOSING: Duration = Duration::from_secs(2);
 /// Questions of late joiners that may wait; more are dropped, and their askers see an empty answer.
 const MAX_QUESTIONS: usize = 32;
@@ -141,7 +141,11 @@ impl ZenohPublisher {
         let stamp_nanos = snapshot.stamp.nanos;
         let [pose, keyframes, splats, manifest] = &mut self.topics;
         Ok([
-            messages.pose().map(|message| pose.outgoing(&message, stamp_nanos)).into_iter().collect::<Result<_, _>>()?,
+            messages
+                .pose()
+                .map(|message| pose.outgoing(&message, stamp_nanos))
+                .into_iter()
+                .collect::<Result<_, _>>()?,
             messages.keyframes().map(|message| keyframes.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
             messages.chunks().map(|message| splats.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
             vec![manifest.outgoing(&messages.manifest(), stamp_nanos)?],
@@ -195,7 +199,7 @@ impl Names {
             return Err(PublishError::Param {
                 name: "namespace",
                 found: params.namespace.clone(),
-                expected: "letters, digits and underscores, parts joined by /",
+                expected: "letters, digits and underscores, parts joined by /".to_owned(),
             });
         }
         Ok(Self { domain_id: params.domain_id, namespace })
@@ -358,10 +362,10 @@ fn config_from_params(params: &PublishParams, listen: &str) -> Result<Config, Pu
         ),
     ];
     for (name, value, key, json) in settings {
-        config.insert_json5(key, &json).map_err(|_| PublishError::Param {
+        config.insert_json5(key, &json).map_err(|e| PublishError::Param {
             name,
             found: value.clone(),
-            expected: "an endpoint such as tcp/127.0.0.1:7447, or nothing",
+            expected: format!("an endpoint such as tcp/127.0.0.1:7447, or nothing ({e})"),
         })?;
     }
     Ok(config)

@@ -43,7 +43,9 @@ fn shuffle<T>(items: &mut [T], dice: &mut Dice) {
 #[test]
 fn pieces_in_any_order_and_twice_give_the_snapshot_once() {
     let mut dice = Dice(3);
-    for (n_splats, n_keyframes, sh_degree) in [(1000, 25, 1), (400, 1, 3), (700, 60, 0), (0, 4, 1), (0, 0, 0), (5, 0, 2)] {
+    for (n_splats, n_keyframes, sh_degree) in
+        [(1000, 25, 1), (400, 1, 3), (700, 60, 0), (0, 4, 1), (0, 0, 0), (5, 0, 2)]
+    {
         let snapshot = random_snapshot(n_splats, n_keyframes, sh_degree, 4);
         let mut sent = pieces(&snapshot, 2048);
         sent.extend(sent.clone());
@@ -238,182 +240,13 @@ fn messages_survive_cdr() {
 fn type_hashes_are_those_of_ros_2() {
     assert_eq!(type_hash::<PoseStamped>(), "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8");
     assert_eq!(type_hash::<Image>(), "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47");
-    assert_eq!(
-        type_hash::<TfMessage>(),
-        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
-    );
+    assert_eq!(type_hash::<TfMessage>(), "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087");
     assert_eq!(type_hash::<SplatChunk>(), "RIHS01_151a9b7a03a5724d3969b9ee1419ffe8d12217df8ea78786242c8855d97fb54a");
     assert_eq!(type_hash::<SplatManifest>(), "RIHS01_ecae8b360482dcaabd4d9452c7edb9b4a99d155ddb3c3a1e09ee3e208f61da37");
-    assert_eq!(type_hash::<KeyframePoseMsg>(), "RIHS01_15510c85564875936e57a31e7da2260c6c89ac8dcd818864e4ea564aacf4b2b8");
+    assert_eq!(
+        type_hash::<KeyframePoseMsg>(),
+        "RIHS01_15510c85564875936e57a31e7da2260c6c89ac8dcd818864e4ea564aacf4b2b8"
+    );
     assert_eq!(type_hash::<KeyframeArray>(), "RIHS01_806a2f07d3cfca046a753e9369f2660b97174ae473b33db404d701f8a62a4e8a");
     assert_eq!(dds_type_name::<PoseStamped>(), "geometry_msgs::msg::dds_::PoseStamped_");
-}
-
-#[cfg(feature = "zenoh")]
-mod over_zenoh {
-    use std::time::Duration;
-
-    use splat_mapper::clock::Stopwatch;
-    use splat_mapper::config::{PublishParams, Settings};
-    use splat_mapper::export::ply;
-    use splat_mapper::publish::PublishError;
-    use splat_mapper::publish::zenoh::ZenohPublisher;
-    use zenoh::query::ConsolidationMode;
-    use zenoh::sample::Sample;
-    use zenoh::{Config, Session, Wait};
-
-    use super::*;
-
-    /// Loopback delivers in milliseconds; so long waits only a test that fails.
-    const PATIENCE: Duration = Duration::from_secs(20);
-
-    fn params(listen: &str) -> PublishParams {
-        let mut params = Settings::shipped().params().unwrap().publish;
-        params.scouting = false;
-        params.zenoh_listen = listen.to_owned();
-        params
-    }
-
-    fn client(listen: &str, connect: &str) -> Session {
-        let mut config = Config::default();
-        config.insert_json5("scouting/multicast/enabled", "false").unwrap();
-        config.insert_json5("listen/endpoints", &format!("[{listen:?}]").replace("\"\"", "")).unwrap();
-        config.insert_json5("connect/endpoints", &format!("[{connect:?}]").replace("\"\"", "")).unwrap();
-        zenoh::open(config).wait().unwrap()
-    }
-
-    fn take(assembler: &mut Assembler, sample: &Sample) -> Option<Snapshot> {
-        let dds_type = sample.key_expr().as_str().rsplit('/').nth(1).unwrap();
-        if dds_type == dds_type_name::<PoseStamped>() {
-            return None;
-        }
-        assembler.add_payload(dds_type, &sample.payload().to_bytes())
-    }
-
-    /// Asks like a late joiner until the publisher is connected and its snapshot whole.
-    fn ask(session: &Session, key: &str) -> Option<Snapshot> {
-        let started = Stopwatch::start();
-        while started.elapsed() < PATIENCE {
-            let mut assembler = Assembler::new(MAX_BYTES);
-            let replies = session.get(key).consolidation(ConsolidationMode::None).wait().unwrap();
-            let complete =
-                replies.into_iter().filter_map(|r| r.into_result().ok()).find_map(|s| take(&mut assembler, &s));
-            if complete.is_some() {
-                return complete;
-            }
-        }
-        None
-    }
-
-    fn free_endpoint() -> String {
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        format!("tcp/{}", listener.local_addr().unwrap())
-    }
-
-    #[test]
-    fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
-        let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-        let endpoints = publisher.endpoints();
-        assert!(endpoints.len() == 1 && !endpoints[0].ends_with(":0"), "{endpoints:?}");
-        publisher.publish(&Arc::new(random_snapshot(10, 1, 1, 1))).unwrap();
-        let snapshot = Arc::new(random_snapshot(6000, 7, 1, 2));
-        publisher.publish(&snapshot).unwrap();
-
-        let session = client("", &endpoints[0]);
-        let received = ask(&session, "0/splat_mapper/**").expect("no snapshot");
-        assert_eq!(received, *snapshot);
-        let folder = tempfile::tempdir().unwrap();
-        let paths = [folder.path().join("sent.ply"), folder.path().join("received.ply")];
-        ply::write(&snapshot.splats, &paths[0]).unwrap();
-        ply::write(&received.splats, &paths[1]).unwrap();
-        assert!(std::fs::read(&paths[0]).unwrap() == std::fs::read(&paths[1]).unwrap());
-
-        // The pose alone, by its own key.
-        let replies = session.get("0/splat_mapper/pose/*/*").wait().unwrap();
-        let poses: Vec<PoseStamped> =
-            replies.into_iter().map(|r| ros::decode(&r.into_result().unwrap().payload().to_bytes()).unwrap()).collect();
-        assert_eq!(poses.len(), 1);
-        assert_eq!(poses[0].pose, snapshot.poses[6].map_from_cam.into());
-        publisher.close().unwrap();
-    }
-
-    #[test]
-    fn a_subscriber_that_was_there_first_receives_every_revision() {
-        let endpoint = free_endpoint();
-        let session = client(&endpoint, "");
-        let live = session.declare_subscriber("7/robot/mapper/**").wait().unwrap();
-        let mut params = params("");
-        params.zenoh_connect = endpoint;
-        params.namespace = "robot/mapper".to_owned();
-        params.domain_id = 7;
-        let mut publisher = ZenohPublisher::open(&params).unwrap();
-        assert!(publisher.endpoints().is_empty());
-        // Publishing begins when the peers know each other.
-        let matching = session.liveliness().declare_subscriber("@ros2_lv/7/**").history(true).wait().unwrap();
-        let tokens: Vec<String> = (0..5)
-            .map(|_| matching.recv_timeout(PATIENCE).unwrap().expect("no token").key_expr().to_string())
-            .collect();
-        let name = "/%/%robot/mapper";
-        assert!(tokens.iter().all(|token| token.contains(name)), "{tokens:?}");
-        assert!(tokens.iter().any(|token| token.contains("/%robot%mapper%splats%manifest/splat_mapper_msgs::msg")));
-
-        let snapshots: Vec<Arc<Snapshot>> =
-            (1..4).map(|revision| Arc::new(random_snapshot(3000, 3, 1, revision))).collect();
-        let mut assembler = Assembler::new(MAX_BYTES);
-        for snapshot in &snapshots {
-            publisher.publish(snapshot).unwrap();
-            let received = std::iter::repeat_with(|| live.recv_timeout(PATIENCE).unwrap().expect("silence"))
-                .find_map(|sample| {
-                    let attachment = sample.attachment().unwrap().to_bytes();
-                    assert_eq!((attachment.len(), attachment[16]), (33, 16));
-                    take(&mut assembler, &sample)
-                });
-            assert_eq!(received.as_ref(), Some(&**snapshot));
-        }
-        publisher.close().unwrap();
-    }
-
-    #[test]
-    fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
-        let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-        let session = client("", &publisher.endpoints()[0]);
-        let snapshot = Arc::new(random_snapshot(2000, 3, 1, 2));
-        publisher.publish(&snapshot).unwrap();
-        ask(&session, "0/splat_mapper/**").expect("no snapshot");
-        for ix in 0..200_u32 {
-            session.put("0/splat_mapper/splats/manifest/x/y", vec![0xff; 1000]).wait().unwrap();
-            // Answers nobody reads.
-            drop(session.get("0/splat_mapper/**").payload(ix.to_le_bytes().to_vec()).wait().unwrap());
-        }
-        assert_eq!(ask(&session, "0/splat_mapper/**").as_ref(), Some(&*snapshot));
-        publisher.close().unwrap();
-    }
-
-    #[test]
-    fn close_is_quick_without_peers_and_with_one_that_reads_nothing() {
-        let publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-        let started = Stopwatch::start();
-        publisher.close().unwrap();
-        assert!(started.secs() < 2.0, "{} s", started.secs());
-    }
-
-    #[test]
-    fn errors_name_the_parameter() {
-        let message = |params: PublishParams| ZenohPublisher::open(&params).unwrap_err().to_string();
-        for bad in ["nonsense", "tcp/127.0.0.1", "warp/127.0.0.1:7447"] {
-            let found = message(params(bad));
-            assert!(found.contains("zenoh_listen"), "{bad}: {found}");
-        }
-        let mut bad = params("");
-        bad.namespace = "a*b".to_owned();
-        assert!(message(bad).contains("publish.namespace"));
-        let mut bad = params("");
-        bad.zenoh_config = "/nowhere/zenoh.json5".to_owned();
-        assert!(message(bad).contains("publish.zenoh_config"));
-        // A port that is taken.
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let taken = format!("tcp/{}", listener.local_addr().unwrap());
-        let fault = ZenohPublisher::open(&params(&taken)).unwrap_err();
-        assert!(matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken), "{fault}");
-    }
 }

@@ -2,7 +2,8 @@
 
 use splat_mapper::splat::Rendering;
 
-use crate::hostile_splats::{KINDS, camera};
+use crate::backends::BACKENDS;
+use crate::reference::hostile::{KINDS, camera};
 use crate::reference::random::Scene;
 use crate::reference::{Params, doubt, render};
 
@@ -137,6 +138,15 @@ fn rounded_twin(scene: &Scene) -> Rendering {
             .collect(),
         rgb: raster.rgb.iter().map(|&value| value as f32).collect(),
         alpha: raster.alpha.iter().map(|&value| value as f32).collect(),
+    }
+}
+
+#[test]
+fn every_backends_pictures_are_the_twins() {
+    for backend in BACKENDS {
+        if let Err(failures) = check(|scene| backend.render(scene)) {
+            panic!("{}:\n{failures}", backend.name);
+        }
     }
 }
 

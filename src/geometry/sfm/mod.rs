@@ -5,7 +5,7 @@
 
 mod adjusting;
 mod calibrating;
-mod dense;
+mod densify;
 mod landmarks;
 mod links;
 mod merging;
@@ -24,7 +24,7 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
-use self::dense::Dense;
+use self::densify::Densifier;
 use self::links::{link_alike, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
@@ -59,7 +59,7 @@ pub(crate) struct Limits {
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
-    dense: Dense,
+    densifier: Densifier,
     seed: u64,
     scene: Scene,
     told: Told,
@@ -71,7 +71,7 @@ impl Sfm {
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
         Self {
             sfm: sfm.clone(),
-            dense: Dense::new(mvs),
+            densifier: Densifier::new(mvs),
             seed,
             scene: Scene::default(),
             told: Told::default(),
@@ -217,16 +217,21 @@ impl Sfm {
             }
         }
     }
+
+    fn densify(&mut self, sparse: SparseBatch) -> GeometryBatch {
+        let scene = &self.scene;
+        self.densifier.densify(sparse, &|id| scene.image_of(id))
+    }
 }
 
 impl GeometryModel for Sfm {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.sparse(batch);
-        Ok(self.dense.densify(&self.scene, sparse))
+        Ok(self.densify(sparse))
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.finish_sparse();
-        Ok(self.dense.densify(&self.scene, sparse))
+        Ok(self.densify(sparse))
     }
 }
