@@ -29,5 +29,6 @@ mod sfm;
 mod shaders;
 mod sources;
 mod synthetic;
+mod synthetic_source;
 mod topics;
 mod trajectory;
