@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod backends;
+mod engine;
 mod gradients;
 mod hostile_splats;
 mod reference;

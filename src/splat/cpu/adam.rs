@@ -36,7 +36,12 @@ pub struct Attribute<'a> {
 pub type Correction = Option<[f32; 2]>;
 
 /// Ages every visible splat that has a finite gradient by one step. Returns how many had none.
-pub fn age(projected: &Projected, is_finite: &[bool], ages: &mut [u32], out: &mut Vec<Correction>) -> usize {
+pub fn age(
+    projected: &Projected,
+    is_finite: &[bool],
+    ages: &mut [u32],
+    out: &mut Vec<Correction>,
+) -> usize {
     out.clear();
     let mut n_skipped = 0;
     for (splat, &is_finite) in projected.splats.iter().zip(is_finite) {
@@ -48,7 +53,10 @@ pub fn age(projected: &Projected, is_finite: &[bool], ages: &mut [u32], out: &mu
         let age = &mut ages[splat.splat_ix as usize];
         *age = age.saturating_add(1);
         let t = f64::from(*age);
-        let correction = [1.0 / (1.0 - f64::from(BETA_1).powf(t)), 1.0 / (1.0 - f64::from(BETA_2).powf(t)).sqrt()];
+        let correction = [
+            1.0 / (1.0 - f64::from(BETA_1).powf(t)),
+            1.0 / (1.0 - f64::from(BETA_2).powf(t)).sqrt(),
+        ];
         out.push(Some(correction.map(|c| c as f32)));
     }
     n_skipped
@@ -56,7 +64,14 @@ pub fn age(projected: &Projected, is_finite: &[bool], ages: &mut [u32], out: &mu
 
 /// Moves one attribute of the visible splats.
 pub fn adam(attribute: Attribute<'_>, projected: &Projected, corrections: &[Correction]) {
-    let Attribute { params, moments, stride, grads, grad_stride, rates } = attribute;
+    let Attribute {
+        params,
+        moments,
+        stride,
+        grads,
+        grad_stride,
+        rates,
+    } = attribute;
     let chunk = CHUNK * stride;
     let chunks = (
         params.par_chunks_mut(chunk),
@@ -64,21 +79,38 @@ pub fn adam(attribute: Attribute<'_>, projected: &Projected, corrections: &[Corr
         moments.second.par_chunks_mut(chunk),
         projected.chunk_ends.par_iter(),
     );
-    chunks.into_par_iter().enumerate().for_each(|(c, (params, first, second, &end))| {
-        let begin = c.checked_sub(1).map_or(0, |before| projected.chunk_ends[before]);
-        for v in begin as usize..end as usize {
-            let Some(correction) = corrections[v] else { continue };
-            let place = projected.splats[v].splat_ix as usize - c * CHUNK;
-            let range = place * stride..place * stride + grad_stride;
-            let grads = &grads[v * grad_stride..(v + 1) * grad_stride];
-            let state = (&mut first[range.clone()], &mut second[range.clone()]);
-            update(&mut params[range], state, grads, correction, rates);
-        }
-    });
+    chunks
+        .into_par_iter()
+        .enumerate()
+        .for_each(|(c, (params, first, second, &end))| {
+            let begin = c
+                .checked_sub(1)
+                .map_or(0, |before| projected.chunk_ends[before]);
+            for v in begin as usize..end as usize {
+                let Some(correction) = corrections[v] else {
+                    continue;
+                };
+                let place = projected.splats[v].splat_ix as usize - c * CHUNK;
+                let range = place * stride..place * stride + grad_stride;
+                let grads = &grads[v * grad_stride..(v + 1) * grad_stride];
+                let state = (&mut first[range.clone()], &mut second[range.clone()]);
+                update(&mut params[range], state, grads, correction, rates);
+            }
+        });
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn update(params: &mut [f32], (first, second): (&mut [f32], &mut [f32]), grads: &[f32], correction: [f32; 2], rates: [f32; 2]) {
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
+fn update(
+    params: &mut [f32],
+    (first, second): (&mut [f32], &mut [f32]),
+    grads: &[f32],
+    correction: [f32; 2],
+    rates: [f32; 2],
+) {
     let n = grads.len();
     let (params, first, second) = (&mut params[..n], &mut first[..n], &mut second[..n]);
     let [unbias_first, unbias_second] = correction;
