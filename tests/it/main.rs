@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 
+#[cfg(feature = "zenoh")]
+
 mod backends;
 mod bags;
 mod declared_lengths;
@@ -16,7 +18,6 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
-#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;
