@@ -3,8 +3,6 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 
-#[cfg(feature = "zenoh")]
-
 mod backends;
 mod bags;
 mod declared_lengths;
@@ -18,6 +16,7 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
+#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;
