@@ -7,7 +7,6 @@ mod formats;
 mod gradients;
 mod hostile_splats;
 mod layers;
-#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod publish;
 mod reference;
