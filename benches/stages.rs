@@ -6,7 +6,9 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Duration;
 
-use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime};
+use criterion::{
+    BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime,
+};
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
@@ -23,7 +25,11 @@ const HEIGHT_PX: u32 = 480;
 const FOCAL_PX: f64 = 350.0;
 
 /// Name, number of splats, and the mean size that gives the wanted splats per tile.
-const SIZES: [(&str, usize, f64); 3] = [("10k", 10_000, 4.0), ("20k", 20_000, 3.0), ("54k", 54_000, 2.0)];
+const SIZES: [(&str, usize, f64); 3] = [
+    ("10k", 10_000, 4.0),
+    ("20k", 20_000, 3.0),
+    ("54k", 54_000, 2.0),
+];
 
 criterion_group!(benches, stages);
 criterion_main!(benches);
@@ -45,36 +51,67 @@ fn stages(c: &mut Criterion) {
 fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingView) {
     let settings = settings();
     let camera = project::Camera::new(&view.intrinsics, &view.cam_from_map);
-    let target = loss::Target { image: &view.image, depth: view.depth.as_deref() };
-    let (mut projected, mut tiles, mut picture) = (project::Projected::default(), bin::Tiles::default(), raster::Raster::default());
+    let target = loss::Target {
+        image: &view.image,
+        depth: view.depth.as_deref(),
+    };
+    let (mut projected, mut tiles, mut picture) = (
+        project::Projected::default(),
+        bin::Tiles::default(),
+        raster::Raster::default(),
+    );
     let mut pixels = loss::PixelGradients::default();
     let (mut instances, mut gradients) = (InstanceGradients::default(), SplatGradients::default());
     let mut bench = |stage: &str, run: &mut dyn FnMut()| {
+        // Once outside of the measurement: a filter may leave it out, and the next stage needs the result.
+        run();
         let mut group = c.benchmark_group(stage);
         configure(&mut group);
         group.bench_function(name, |b| b.iter(&mut *run));
         group.finish();
     };
-    bench("project", &mut || project::project(black_box(splats), &camera, 3, &mut projected));
+    bench("project", &mut || {
+        project::project(black_box(splats), &camera, 3, &mut projected);
+    });
     let visible = &projected.splats;
-    bench("bin", &mut || bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles));
-    bench("raster", &mut || raster::raster(visible, &tiles, &mut picture));
+    bench("bin", &mut || {
+        bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles);
+    });
+    bench("raster", &mut || {
+        raster::raster(visible, &tiles, &mut picture);
+    });
     bench("loss", &mut || {
         black_box(loss::loss(&picture, &target, &settings, &mut pixels));
     });
-    bench("raster_backward", &mut || raster_backward(visible, &tiles, &picture, &pixels, &mut instances));
-    let forward = Forward { splats, camera: &camera, visible, tiles: &tiles };
-    bench("project_backward", &mut || project_backward(forward, &instances, &settings, &mut gradients));
+    bench("raster_backward", &mut || {
+        raster_backward(visible, &tiles, &picture, &pixels, &mut instances);
+    });
+    let forward = Forward {
+        splats,
+        camera: &camera,
+        visible,
+        tiles: &tiles,
+    };
+    bench("project_backward", &mut || {
+        project_backward(forward, &instances, &settings, &mut gradients);
+    });
     #[expect(clippy::print_stderr, reason = "says what was measured")]
     {
         let per_tile = tiles.instances.len() / tiles.n_tiles();
-        eprintln!("{name}: {} visible, {} instances, {per_tile} per tile\n", visible.len(), tiles.instances.len());
+        let used = 100 * instances.slots.len() / tiles.instances.len();
+        eprintln!(
+            "{name}: {} visible, {per_tile} instances per tile, {used} % of them used\n",
+            visible.len()
+        );
     }
 }
 
 fn configure(group: &mut BenchmarkGroup<'_, WallTime>) {
     group.throughput(Throughput::Elements(1));
-    group.sample_size(20).warm_up_time(Duration::from_secs(1)).measurement_time(Duration::from_secs(3));
+    group
+        .sample_size(20)
+        .warm_up_time(Duration::from_secs(1))
+        .measurement_time(Duration::from_secs(3));
 }
 
 fn settings() -> StepSettings {
@@ -99,17 +136,29 @@ fn settings() -> StepSettings {
 
 fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
     let mut rng = Pcg32::seed_from_u64(7);
-    let mut splats = Splats { sh_degree: 3, ..Splats::default() };
+    let mut splats = Splats {
+        sh_degree: 3,
+        ..Splats::default()
+    };
     for _ in 0..n {
         let z = rng.random_range(0.5..3.0);
-        let x = (rng.random_range(-5.0..f64::from(WIDTH_PX) + 5.0) - 0.5 * f64::from(WIDTH_PX)) * z / FOCAL_PX;
-        let y = (rng.random_range(-5.0..f64::from(HEIGHT_PX) + 5.0) - 0.5 * f64::from(HEIGHT_PX)) * z / FOCAL_PX;
+        let x = (rng.random_range(-5.0..f64::from(WIDTH_PX) + 5.0) - 0.5 * f64::from(WIDTH_PX)) * z
+            / FOCAL_PX;
+        let y = (rng.random_range(-5.0..f64::from(HEIGHT_PX) + 5.0) - 0.5 * f64::from(HEIGHT_PX))
+            * z
+            / FOCAL_PX;
         splats.means.push([x as f32, y as f32, z as f32]);
         let size = (size_px * z / FOCAL_PX).ln();
-        splats.log_scales.push(std::array::from_fn(|_| (size + rng.random_range(-1.2..0.7)) as f32));
-        splats.quats.push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
+        splats.log_scales.push(std::array::from_fn(|_| {
+            (size + rng.random_range(-1.2..0.7)) as f32
+        }));
+        splats
+            .quats
+            .push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
         splats.opacity_logits.push(rng.random_range(-3.0..2.0));
-        splats.sh.extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
+        splats
+            .sh
+            .extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
         splats.anchors.push(0);
     }
     let n_pixels = (WIDTH_PX * HEIGHT_PX) as usize;
@@ -121,7 +170,11 @@ fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
         confidence: vec![1.0; n_pixels],
     };
     let view = TrainingView {
-        image: Arc::new(RgbImage { width_px: WIDTH_PX, height_px: HEIGHT_PX, pixels }),
+        image: Arc::new(RgbImage {
+            width_px: WIDTH_PX,
+            height_px: HEIGHT_PX,
+            pixels,
+        }),
         intrinsics: Intrinsics {
             width_px: WIDTH_PX,
             height_px: HEIGHT_PX,

@@ -120,7 +120,11 @@ impl Distortion {
             Self::Equidistant(k) => {
                 let radius = ideal.length();
                 // The ratio angle / radius tends to 1; below this radius it is 1 to the last digit.
-                if radius < 1e-9 { ideal } else { ideal * (fisheye(k, radius.atan()).0 / radius) }
+                if radius < 1e-9 {
+                    ideal
+                } else {
+                    ideal * (fisheye(k, radius.atan()).0 / radius)
+                }
             }
         }
     }
@@ -151,8 +155,9 @@ impl Distortion {
         let mut radius = 0.0;
         while radius < MAX_RADIUS {
             let next = lands_at(radius + RADIUS_STEP);
-            // Written so that NaN ends the loop too.
-            if !(next > last) {
+            // False for NaN, which ends the loop too.
+            let grows = next > last;
+            if !grows {
                 break;
             }
             last = next;
@@ -166,7 +171,9 @@ impl Lens {
     /// Pixel of a point in the camera frame, through the real lens; `None` at or behind the camera.
     pub fn project(&self, point_in_cam: DVec3) -> Option<DVec2> {
         (point_in_cam.z > 1e-9).then(|| {
-            let landed = self.distortion.distort(point_in_cam.truncate() / point_in_cam.z);
+            let landed = self
+                .distortion
+                .distort(point_in_cam.truncate() / point_in_cam.z);
             let i = &self.intrinsics;
             DVec2::new(i.fx * landed.x + i.cx, i.fy * landed.y + i.cy)
         })
@@ -175,12 +182,17 @@ impl Lens {
     /// Point with z = 1 on the ray that lands on a pixel; `None` where no ray in front of the camera does.
     pub fn ray_in_cam(&self, pixel: DVec2) -> Option<DVec3> {
         let landed = self.intrinsics.ray_in_cam(pixel).truncate();
-        self.distortion.undistort(landed).map(|ideal| ideal.extend(1.0))
+        self.distortion
+            .undistort(landed)
+            .map(|ideal| ideal.extend(1.0))
     }
 
     /// The same lens with its picture resized; coefficients live on the plane z = 1 and stay.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
-        Self { intrinsics: self.intrinsics.resized(width_px, height_px), distortion: self.distortion }
+        Self {
+            intrinsics: self.intrinsics.resized(width_px, height_px),
+            distortion: self.distortion,
+        }
     }
 }
 
@@ -194,7 +206,10 @@ fn radial(k: &[f64; 8], r2: f64) -> (f64, f64) {
     let below = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]));
     let above_rate = k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4]);
     let below_rate = k[5] + r2 * (2.0 * k[6] + r2 * 3.0 * k[7]);
-    (above / below, (above_rate * below - above * below_rate) / (below * below))
+    (
+        above / below,
+        (above_rate * below - above * below_rate) / (below * below),
+    )
 }
 
 /// Brown-Conrady with rational radial part: where the ray lands, and the derivative of that.
@@ -208,36 +223,45 @@ fn brown(k: &[f64; 8], p: DVec2) -> (DVec2, DMat2) {
     );
     let mixed = 2.0 * p.x * p.y * rate + 2.0 * p1 * p.x + 2.0 * p2 * p.y;
     let derivative = DMat2::from_cols(
-        DVec2::new(factor + 2.0 * p.x * p.x * rate + 2.0 * p1 * p.y + 6.0 * p2 * p.x, mixed),
-        DVec2::new(mixed, factor + 2.0 * p.y * p.y * rate + 6.0 * p1 * p.y + 2.0 * p2 * p.x),
+        DVec2::new(
+            factor + 2.0 * p.x * p.x * rate + 2.0 * p1 * p.y + 6.0 * p2 * p.x,
+            mixed,
+        ),
+        DVec2::new(
+            mixed,
+            factor + 2.0 * p.y * p.y * rate + 6.0 * p1 * p.y + 2.0 * p2 * p.x,
+        ),
     );
     (landed, derivative)
 }
 
 fn undistort_brown(k: &[f64; 8], distorted: DVec2) -> Option<DVec2> {
-    let mut ideal = distorted;
+    let is_before_fold = |p: DVec2| brown(k, p).1.determinant() > 1e-12;
+    // A strong pincushion shows rays far out, where the polynomial may have folded; the axis is always before it.
+    let mut ideal = if is_before_fold(distorted) {
+        distorted
+    } else {
+        DVec2::ZERO
+    };
     let mut residual = brown(k, ideal).0 - distorted;
     for _ in 0..MAX_NEWTON_STEPS {
-        let (_, derivative) = brown(k, ideal);
-        // A derivative that has turned over belongs to the part beyond the fold.
-        if !(derivative.determinant() > 1e-12) {
+        if !is_before_fold(ideal) {
             return None;
         }
-        if residual.length() < 1e-15 {
-            break;
-        }
-        let step = derivative.inverse() * residual;
+        let step = brown(k, ideal).1.inverse() * residual;
+        let at_share = |share: f64| {
+            let next = ideal - step * share;
+            (next, brown(k, next).0 - distorted)
+        };
         // Halving keeps Newton from jumping over the fold of a strong polynomial.
-        let mut share = 1.0;
-        let (mut next, mut next_residual) = (ideal - step, brown(k, ideal - step).0 - distorted);
-        while !(next_residual.length() <= residual.length()) && share > 1e-3 {
-            share *= 0.5;
-            next = ideal - step * share;
-            next_residual = brown(k, next).0 - distorted;
-        }
-        if !(next_residual.length() < residual.length()) {
+        let shares = std::iter::successors(Some(1.0), |share| Some(share * 0.5)).take(10);
+        let better = shares
+            .map(at_share)
+            .find(|(_, next)| next.length() < residual.length());
+        // None is better when the residual is down to rounding errors.
+        let Some((next, next_residual)) = better else {
             break;
-        }
+        };
         (ideal, residual) = (next, next_residual);
     }
     (residual.length() < SOLVED && radial(k, ideal.length_squared()).0 > 0.0).then_some(ideal)
@@ -259,7 +283,8 @@ fn undistort_fisheye(k: &[f64; 4], distorted: DVec2) -> Option<DVec2> {
     let mut angle = shown.min(1.5);
     for _ in 0..MAX_NEWTON_STEPS {
         let (at, rate) = fisheye(k, angle);
-        if !(rate > 1e-6) {
+        let is_before_fold = rate > 1e-6;
+        if !is_before_fold {
             return None;
         }
         let step = (at - shown) / rate;

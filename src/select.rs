@@ -6,6 +6,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use glam::DVec2;
 use kornia_image::{Image, ImageSize};
 use kornia_imgproc::features::gftt_response;
 use kornia_imgproc::optical_flow_pyr_lk::{PyrLKParams, calc_optical_flow_pyr_lk};
@@ -29,6 +30,8 @@ const MIN_CORNER_RESPONSE: f32 = 5e-3;
 const MAX_TRACK_ERROR: f32 = 0.1;
 /// Tracks are followed forth and back; where they don't return to within this they have slipped.
 const MAX_RETURN_PX: f32 = 1.5;
+/// Rounds of the robust fit of a shift, turn and zoom.
+const FIT_ROUNDS: usize = 10;
 /// Frames whose median sharpness is the measure.
 const SHARPNESS_WINDOW: usize = 15;
 
@@ -64,8 +67,8 @@ impl std::fmt::Debug for LastKeyframe {
 /// What tracking says of a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Motion {
-    /// Median, as a share of the longer side.
-    Median(f64),
+    /// Shares of the longer side: the median motion, and the motion that depth causes (`parallax_flow`).
+    Measured { flow: f64, parallax: f64 },
     /// Most tracks died: the view is another one.
     Lost,
     /// Nothing to track.
@@ -98,9 +101,10 @@ impl Selector {
                 Motion::Unknown => false,
                 // A blurry frame loses its tracks too; the next sharp one finds them still lost.
                 Motion::Lost => is_sharp,
-                Motion::Median(flow) => {
-                    flow >= self.params.min_flow
-                        && (is_sharp || flow >= self.params.min_flow + self.params.max_wait)
+                Motion::Measured { flow, parallax } => {
+                    let params = &self.params;
+                    let share = (flow / params.min_flow).max(parallax / params.min_parallax);
+                    share >= 1.0 && (is_sharp || flow >= params.min_flow + params.max_wait)
                 }
             };
             if too_soon || !moved {
@@ -187,7 +191,11 @@ impl LastKeyframe {
             .map(|(start, at)| distance(*start, *at))
             .collect();
         motion.sort_by(f32::total_cmp);
-        Motion::Median(f64::from(motion[motion.len() / 2] / width.max(height)))
+        let longest = f64::from(width.max(height));
+        Motion::Measured {
+            flow: f64::from(motion[motion.len() / 2]) / longest,
+            parallax: parallax_flow(&self.tracks) / longest,
+        }
     }
 }
 
@@ -344,6 +352,36 @@ fn track(
             .map(|i| tracked(i).then(|| result.next_pts[i]))
             .collect(),
     )
+}
+
+/// Pixels by which the tracks deviate from the shift, turn and zoom that fits most of them: what depth causes, while
+/// a camera that only turns causes little. The 80th percentile, because most of a picture may lie at one depth.
+fn parallax_flow(tracks: &[([f32; 2], [f32; 2])]) -> f64 {
+    let pairs: Vec<(DVec2, DVec2)> =
+        tracks.iter().map(|(a, b)| (DVec2::from(a.map(f64::from)), DVec2::from(b.map(f64::from)))).collect();
+    let mut weights = vec![1.0; pairs.len()];
+    let mut residuals = vec![0.0; pairs.len()];
+    // Iteratively reweighted towards the smallest sum of distances. As complex numbers: to = turn * from + shift.
+    for _ in 0..FIT_ROUNDS {
+        let total: f64 = weights.iter().sum();
+        let mean = |pick: fn(&(DVec2, DVec2)) -> DVec2| {
+            pairs.iter().zip(&weights).map(|(pair, w)| pick(pair) * *w).sum::<DVec2>() / total
+        };
+        let (from_mean, to_mean) = (mean(|p| p.0), mean(|p| p.1));
+        let (mut turn, mut spread) = (DVec2::ZERO, 0.0);
+        for ((from, to), w) in pairs.iter().zip(&weights) {
+            let (from, to) = (*from - from_mean, *to - to_mean);
+            turn += DVec2::new(from.dot(to), from.perp_dot(to)) * *w;
+            spread += from.length_squared() * w;
+        }
+        let turn = if spread > 0.0 { turn / spread } else { DVec2::X };
+        for (i, (from, to)) in pairs.iter().enumerate() {
+            residuals[i] = (to_mean + turn.rotate(*from - from_mean) - *to).length();
+            weights[i] = 1.0 / residuals[i].max(1.0);
+        }
+    }
+    residuals.sort_by(f64::total_cmp);
+    residuals.get(residuals.len() * 4 / 5).copied().unwrap_or(0.0)
 }
 
 fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {

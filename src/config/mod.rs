@@ -83,6 +83,7 @@ pub struct SourceParams {
 pub struct SelectParams {
     pub all: bool,
     pub min_flow: f64,
+    pub min_parallax: f64,
     pub max_rate_hz: f64,
     pub min_sharpness: f64,
     pub max_wait: f64,

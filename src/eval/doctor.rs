@@ -66,6 +66,7 @@ impl Check {
 /// All checks, needed things first. Relative paths, such as `out/`, are meant from the current folder.
 pub fn doctor() -> Vec<Check> {
     let here = Path::new(".");
+    let named_onnx_runtime = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
     vec![
         cpu(),
         memory(free_memory_mib()),
@@ -73,15 +74,9 @@ pub fn doctor() -> Vec<Check> {
         disk(free_disk_mib()),
         vulkan_loader(&library_folders()),
         vulkan_driver(&icd_files()),
-        ros2(
-            std::env::var("ROS_DISTRO").ok().as_deref(),
-            Path::new("/opt/ros"),
-        ),
+        ros2(std::env::var("ROS_DISTRO").ok(), Path::new("/opt/ros")),
         cameras(Path::new("/dev")),
-        onnx_runtime(
-            std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from),
-            &library_folders(),
-        ),
+        onnx_runtime(named_onnx_runtime, &library_folders()),
         multicast(),
     ]
 }
@@ -220,7 +215,7 @@ fn vulkan_driver(icd_files: &[PathBuf]) -> Check {
     Check::ok("vulkan driver", names.join(", "))
 }
 
-fn ros2(distro: Option<&str>, root: &Path) -> Check {
+fn ros2(distro: Option<String>, root: &Path) -> Check {
     if let Some(distro) = distro.filter(|distro| !distro.is_empty()) {
         return Check::ok("ros 2", format!("{distro} is sourced"));
     }
@@ -376,7 +371,7 @@ mod tests {
             fix.starts_with("source ") && fix.ends_with("jazzy/setup.bash"),
             "{fix}"
         );
-        assert_eq!(ros2(Some("jazzy"), root.path()).state, State::Ok);
+        assert_eq!(ros2(Some("jazzy".to_owned()), root.path()).state, State::Ok);
     }
 
     #[test]

@@ -40,7 +40,7 @@ pub struct ReportInputs<'a> {
 
 pub fn write_html(inputs: &ReportInputs<'_>, path: &Path) -> Result<(), EvalError> {
     let page =
-        page(inputs).map_err(|e| EvalError::writing("the pictures of the report", e, path))?;
+        page(inputs).map_err(|e| EvalError::writing("the pictures of the report", &e, path))?;
     write_atomically("the report page", page.into_string().as_bytes(), path)
 }
 
@@ -112,33 +112,36 @@ fn notices(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
 
 fn tiles(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
     let quality = &report.quality;
-    let tile = |name: &str, value: String, unit: &str, more: String| {
-        html! {
-            div.card.tile { span.name { (name) } b { (value) @if !unit.is_empty() { " " small { (unit) } } } span.soft { (more) } }
-        }
+    let tile = |name: &str, value: String, more: String| {
+        html! { div.card.tile { span.name { (name) } b { (value) } span.soft { (more) } } }
     };
     let held_out = format!(
-        "SSIM {}, every {} keyframe held out",
+        "SSIM {}; every {} keyframe held out",
         figure(quality.ssim_holdout),
         ordinal(quality.holdout_every)
+    );
+    let steps = format!(
+        "after {} steps, {} per second",
+        count(report.steps),
+        figure(report.steps_per_s)
     );
     html! {
         section.tiles {
             @if quality.holdout_every > 0 {
-                (tile("Held-out views", decibels(quality.psnr_holdout), "dB PSNR", held_out))
+                (tile("Held-out PSNR", format!("{} dB", decibels(quality.psnr_holdout)), held_out))
             } @else {
-                (tile("Training views", decibels(quality.psnr_train), "dB PSNR", "no view was held out".to_owned()))
+                (tile("Training PSNR", format!("{} dB", decibels(quality.psnr_train)), "no view was held out".to_owned()))
             }
             @if let Some(evaluation) = evaluation {
-                (tile("Trajectory error", figure(evaluation.ate_percent_of_extent), "% of extent",
-                    format!("ATE {}, rotation {}°", figure(evaluation.ate_rmse), figure(evaluation.rotation_mean_deg))))
+                (tile("Trajectory error", format!("{} %", figure(evaluation.ate_percent_of_extent)),
+                    format!("of the extent; rotation {}° mean", figure(evaluation.rotation_mean_deg))))
             }
-            (tile("Keyframes", count(report.keyframes.registered), &format!("of {}", count(report.keyframes.selected)),
-                format!("registered, from {} frames", count(report.frames.received))))
-            (tile("Splats", count(report.splats), "", format!("{} steps, {} per second", count(report.steps), figure(report.steps_per_s))))
-            (tile("Wall time", figure(Some(report.timing_s.wall)), "s", format!("optimising {} s", figure(Some(report.timing_s.optimise)))))
-            (tile("Keyframe to pose", milliseconds(report.latency_ms.keyframe_to_pose_p50), "median",
-                format!("95 % within {}", milliseconds(report.latency_ms.keyframe_to_pose_p95))))
+            (tile("Keyframes placed", format!("{} of {}", count(report.keyframes.registered), count(report.keyframes.selected)),
+                format!("from {} frames", count(report.frames.received))))
+            (tile("Splats", count(report.splats), steps))
+            (tile("Wall time", format!("{} s", figure(Some(report.timing_s.wall))), format!("optimising {} s", figure(Some(report.timing_s.optimise)))))
+            (tile("Keyframe to pose", milliseconds(report.latency_ms.keyframe_to_pose_p50),
+                format!("median; 95 % within {}", milliseconds(report.latency_ms.keyframe_to_pose_p95))))
         }
     }
 }

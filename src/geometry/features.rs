@@ -33,7 +33,8 @@ pub struct Features {
 
 /// The grey picture that features are found on: the longer side is at most `max_side`.
 pub fn working_picture(image: &RgbImage, max_side: u32) -> Grey {
-    let luma = |p: &[u8]| (77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) as f32 / (256.0 * 255.0);
+    let luma =
+        |p: &[u8]| (77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) as f32 / (256.0 * 255.0);
     let (w, h) = (image.width_px, image.height_px);
     let pixels: Vec<f32> = image.pixels.chunks_exact(3).map(luma).collect();
     let full = Grey { width: w as usize, height: h as usize, pixels };
@@ -100,7 +101,8 @@ impl Features {
 
 fn resized(full: &Grey, width: u32, height: u32) -> Option<Grey> {
     let bytes: Vec<u8> = full.pixels.iter().flat_map(|v| v.to_ne_bytes()).collect();
-    let source = fir::images::Image::from_vec_u8(full.width as u32, full.height as u32, bytes, fir::PixelType::F32).ok()?;
+    let source =
+        fir::images::Image::from_vec_u8(full.width as u32, full.height as u32, bytes, fir::PixelType::F32).ok()?;
     let mut target = fir::images::Image::new(width, height, fir::PixelType::F32);
     let options = fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Hamming));
     fir::Resizer::new().resize(&source, &mut target, &options).ok()?;

@@ -8,6 +8,7 @@ pub mod matching;
 pub mod triangulate;
 pub mod two_view;
 pub mod pnp;
+pub mod focal;
 pub mod bundle;
 pub mod sfm;
 

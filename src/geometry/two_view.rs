@@ -38,9 +38,8 @@ pub fn motion(pairs: &[(DVec2, DVec2)], cameras: [&Intrinsics; 2], max_error_px:
         matrices.map(|e| DMat3::from_cols_array(&e.into())).collect()
     };
     let essential = consensus::<5>(&rays, limit, seed, solve)?;
-    let within = |e: &DMat3| -> Vec<usize> {
-        (0..rays.len()).filter(|&i| sampson(e, rays[i]) <= limit * limit).collect()
-    };
+    let within =
+        |e: &DMat3| -> Vec<usize> { (0..rays.len()).filter(|&i| sampson(e, rays[i]) <= limit * limit).collect() };
     let mut inliers = within(&essential);
     let picked: Vec<(DVec2, DVec2)> = inliers.iter().map(|&i| rays[i]).collect();
     let mut pose = facing(&essential, &picked)?;
@@ -245,7 +244,8 @@ fn conditioning(points: impl Iterator<Item = DVec2> + Clone) -> DMat3 {
     DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, DVec3::new(-mean.x * scale, -mean.y * scale, 1.0))
 }
 
-fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
+/// Least squares over all pairs (Hartley 1997); at least eight.
+pub fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
     if pairs.len() < 8 {
         return None;
     }
@@ -255,7 +255,15 @@ fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
     for (a, b) in pairs {
         let (a, b) = (first * a.extend(1.0), second * b.extend(1.0));
         let row = SVector::<f64, 9>::from_column_slice(&[
-            b.x * a.x, b.x * a.y, b.x, b.y * a.x, b.y * a.y, b.y, a.x, a.y, 1.0,
+            b.x * a.x,
+            b.x * a.y,
+            b.x,
+            b.y * a.x,
+            b.y * a.y,
+            b.y,
+            a.x,
+            a.y,
+            1.0,
         ]);
         normal += row * row.transpose();
     }
@@ -292,7 +300,8 @@ fn four_point(pairs: &[(DVec2, DVec2); 4]) -> Option<DMat3> {
         }
     }
     let h = system.lu().solve(&right)?;
-    let matrix = DMat3::from_cols(DVec3::new(h[0], h[3], h[6]), DVec3::new(h[1], h[4], h[7]), DVec3::new(h[2], h[5], 1.0));
+    let matrix =
+        DMat3::from_cols(DVec3::new(h[0], h[3], h[6]), DVec3::new(h[1], h[4], h[7]), DVec3::new(h[2], h[5], 1.0));
     matrix.is_finite().then_some(matrix)
 }
 

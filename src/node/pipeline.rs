@@ -134,7 +134,7 @@ impl Stages {
             let mut publish = |snapshot, progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
                 drop(snapshots_tx.send(snapshot));
-                drop(progress_tx.send(progress));
+                progress_tx.send(progress).ok();
             };
             run_map(self.map, is_live, &answers, &mut publish)
         })?;

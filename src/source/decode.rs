@@ -22,14 +22,29 @@ const MAX_BYTES: u64 = 512 << 20;
 
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum DecodeError {
-    #[error("encoding {found:?}, expected rgb8 bgr8 rgba8 bgra8 mono8 yuyv uyvy nv12 or an 8-bit Bayer pattern")]
+    #[error(
+        "encoding {found:?}, expected rgb8 bgr8 rgba8 bgra8 mono8 yuyv uyvy nv12 or an 8-bit Bayer pattern"
+    )]
     Encoding { found: String },
     #[error("depth encoding {found:?}, expected 16UC1 (mm) or 32FC1 (m)")]
     DepthEncoding { found: String },
     #[error("picture of {width}x{height} px in {encoding}, expected {expected}")]
-    Size { width: u32, height: u32, encoding: String, expected: &'static str },
-    #[error("{found_bytes} bytes for {width}x{height} px with rows of {step}, expected {expected_bytes}")]
-    Short { found_bytes: usize, width: u32, height: u32, step: u32, expected_bytes: u64 },
+    Size {
+        width: u32,
+        height: u32,
+        encoding: String,
+        expected: &'static str,
+    },
+    #[error(
+        "{found_bytes} bytes for {width}x{height} px with rows of {step}, expected {expected_bytes}"
+    )]
+    Short {
+        found_bytes: usize,
+        width: u32,
+        height: u32,
+        step: u32,
+        expected_bytes: u64,
+    },
     #[error("compressed picture of {found_bytes} bytes: {reason}")]
     Compressed { found_bytes: usize, reason: String },
 }
@@ -53,7 +68,11 @@ impl<'a> Rows<'a> {
             expected_bytes,
         };
         // Some drivers leave step 0; then rows are packed.
-        let step = if image.step == 0 { row_bytes } else { u64::from(image.step) };
+        let step = if image.step == 0 {
+            row_bytes
+        } else {
+            u64::from(image.step)
+        };
         if step < row_bytes {
             return Err(short(image.step, row_bytes));
         }
@@ -62,7 +81,12 @@ impl<'a> Rows<'a> {
         if (image.data.len() as u64) < needed {
             return Err(short(image.step, needed));
         }
-        Ok(Self { data: &image.data, step: step as usize, row_bytes: row_bytes as usize, n_rows: n_rows as usize })
+        Ok(Self {
+            data: &image.data,
+            step: step as usize,
+            row_bytes: row_bytes as usize,
+            n_rows: n_rows as usize,
+        })
     }
 
     fn iter(&self) -> impl Iterator<Item = &'a [u8]> {
@@ -83,8 +107,16 @@ impl<'a> Rows<'a> {
 
 /// A raw picture as RGB. Names are those of `sensor_msgs/image_encodings.hpp` and of V4L2 drivers.
 pub fn raw(image: &Image) -> Result<RgbImage, DecodeError> {
-    check_size(image, "1 to 16384 px a side", |w, h| w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE)?;
-    let rows = |bytes_per_px: u64| Rows::of(image, u64::from(image.width) * bytes_per_px, u64::from(image.height));
+    check_size(image, "1 to 16384 px a side", |w, h| {
+        w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE
+    })?;
+    let rows = |bytes_per_px: u64| {
+        Rows::of(
+            image,
+            u64::from(image.width) * bytes_per_px,
+            u64::from(image.height),
+        )
+    };
     let pixels = match image.encoding.as_str() {
         "rgb8" => rows(3)?.map(|&[r, g, b]| [r, g, b]),
         "bgr8" | "8UC3" => rows(3)?.map(|&[b, g, r]| [r, g, b]),
@@ -98,17 +130,30 @@ pub fn raw(image: &Image) -> Result<RgbImage, DecodeError> {
         "bayer_gbrg8" => bayer(&rows(1)?, BayerPattern::Gbrg),
         "bayer_grbg8" => bayer(&rows(1)?, BayerPattern::Grbg),
         "bayer_bggr8" => bayer(&rows(1)?, BayerPattern::Bggr),
-        found => return Err(DecodeError::Encoding { found: excerpt(found) }),
+        found => {
+            return Err(DecodeError::Encoding {
+                found: excerpt(found),
+            });
+        }
     };
-    Ok(RgbImage { width_px: image.width, height_px: image.height, pixels })
+    Ok(RgbImage {
+        width_px: image.width,
+        height_px: image.height,
+        pixels,
+    })
 }
 
 /// JPEG or PNG, told by its first bytes: the `format` text of real drivers says too little.
 pub fn compressed(bytes: &[u8]) -> Result<RgbImage, DecodeError> {
-    let fail = |reason: String| DecodeError::Compressed { found_bytes: bytes.len(), reason };
+    let fail = |reason: String| DecodeError::Compressed {
+        found_bytes: bytes.len(),
+        reason,
+    };
     let format = image::guess_format(bytes).map_err(|e| fail(e.to_string()))?;
     match format {
-        ImageFormat::Jpeg if !jpeg_is_whole(bytes) => return Err(fail("JPEG is cut off".to_owned())),
+        ImageFormat::Jpeg if !jpeg_is_whole(bytes) => {
+            return Err(fail("JPEG is cut off".to_owned()));
+        }
         ImageFormat::Jpeg | ImageFormat::Png => {}
         other => return Err(fail(format!("{other:?}, expected JPEG or PNG"))),
     }
@@ -123,55 +168,119 @@ pub fn compressed(bytes: &[u8]) -> Result<RgbImage, DecodeError> {
     let (width_px, height_px) = decoder.dimensions();
     // The JPEG decoder takes memory of its own before it asks for the limit of the output.
     if decoder.total_bytes() > budget || u64::from(width_px) * u64::from(height_px) * 3 > budget {
-        return Err(fail(format!("{width_px}x{height_px} px, more than its length can hold")));
+        return Err(fail(format!(
+            "{width_px}x{height_px} px, more than its length can hold"
+        )));
     }
-    let picture = image::DynamicImage::from_decoder(decoder).map_err(|e| fail(e.to_string()))?.into_rgb8();
+    let picture = image::DynamicImage::from_decoder(decoder)
+        .map_err(|e| fail(e.to_string()))?
+        .into_rgb8();
     if width_px == 0 || height_px == 0 {
         return Err(fail("picture without pixels".to_owned()));
     }
-    Ok(RgbImage { width_px, height_px, pixels: picture.into_raw() })
+    Ok(RgbImage {
+        width_px,
+        height_px,
+        pixels: picture.into_raw(),
+    })
 }
 
 /// Depth in metres; 0 where the sensor had none. Exact by agreement, so confidence is 1 wherever there is a value.
 pub fn depth(image: &Image) -> Result<DepthMap, DecodeError> {
-    check_size(image, "1 to 16384 px a side", |w, h| w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE)?;
-    let rows = |bytes_per_px: u64| Rows::of(image, u64::from(image.width) * bytes_per_px, u64::from(image.height));
+    check_size(image, "1 to 16384 px a side", |w, h| {
+        w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE
+    })?;
+    let rows = |bytes_per_px: u64| {
+        Rows::of(
+            image,
+            u64::from(image.width) * bytes_per_px,
+            u64::from(image.height),
+        )
+    };
     let is_big = image.is_bigendian != 0;
     let depth: Vec<f32> = match image.encoding.as_str() {
         "16UC1" | "mono16" => {
-            let metres = |b: &[u8; 2]| depth_of_millimetres(if is_big { u16::from_be_bytes(*b) } else { u16::from_le_bytes(*b) });
-            rows(2)?.iter().flat_map(|row| row.as_chunks::<2>().0).map(metres).collect()
+            let metres = |b: &[u8; 2]| {
+                depth_of_millimetres(if is_big {
+                    u16::from_be_bytes(*b)
+                } else {
+                    u16::from_le_bytes(*b)
+                })
+            };
+            rows(2)?
+                .iter()
+                .flat_map(|row| row.as_chunks::<2>().0)
+                .map(metres)
+                .collect()
         }
         "32FC1" => {
-            let metres = |b: &[u8; 4]| if is_big { f32::from_be_bytes(*b) } else { f32::from_le_bytes(*b) };
+            let metres = |b: &[u8; 4]| {
+                if is_big {
+                    f32::from_be_bytes(*b)
+                } else {
+                    f32::from_le_bytes(*b)
+                }
+            };
             let rows = rows(4)?;
-            rows.iter().flat_map(|row| row.as_chunks::<4>().0).map(|b| depth_or_none(metres(b))).collect()
+            rows.iter()
+                .flat_map(|row| row.as_chunks::<4>().0)
+                .map(|b| depth_or_none(metres(b)))
+                .collect()
         }
-        found => return Err(DecodeError::DepthEncoding { found: excerpt(found) }),
+        found => {
+            return Err(DecodeError::DepthEncoding {
+                found: excerpt(found),
+            });
+        }
     };
     Ok(depth_map(image.width, image.height, depth))
 }
 
 fn depth_map(width_px: u32, height_px: u32, depth: Vec<f32>) -> DepthMap {
-    let confidence = depth.iter().map(|&d| if d > 0.0 { 1.0 } else { 0.0 }).collect();
-    DepthMap { width_px, height_px, depth, confidence }
+    let confidence = depth
+        .iter()
+        .map(|&d| if d > 0.0 { 1.0 } else { 0.0 })
+        .collect();
+    DepthMap {
+        width_px,
+        height_px,
+        depth,
+        confidence,
+    }
 }
 
 fn depth_of_millimetres(millimetres: u16) -> f32 {
     // Kinect drivers write 65535 for "none", everyone else 0.
-    if millimetres == u16::MAX { 0.0 } else { f32::from(millimetres) * 0.001 }
+    if millimetres == u16::MAX {
+        0.0
+    } else {
+        f32::from(millimetres) * 0.001
+    }
 }
 
 fn depth_or_none(metres: f32) -> f32 {
-    if metres.is_finite() && metres > 0.0 { metres } else { 0.0 }
+    if metres.is_finite() && metres > 0.0 {
+        metres
+    } else {
+        0.0
+    }
 }
 
-fn check_size(image: &Image, expected: &'static str, fits: impl Fn(u32, u32) -> bool) -> Result<(), DecodeError> {
+fn check_size(
+    image: &Image,
+    expected: &'static str,
+    fits: impl Fn(u32, u32) -> bool,
+) -> Result<(), DecodeError> {
     let (width, height) = (image.width, image.height);
     if fits(width, height) {
         return Ok(());
     }
-    Err(DecodeError::Size { width, height, encoding: excerpt(&image.encoding), expected })
+    Err(DecodeError::Size {
+        width,
+        height,
+        encoding: excerpt(&image.encoding),
+        expected,
+    })
 }
 
 /// A name from outside, short enough for a log line.
@@ -179,8 +288,13 @@ fn excerpt(name: &str) -> String {
     name.chars().take(40).collect()
 }
 
-type PackedToRgb =
-    fn(&YuvPackedImage<'_, u8>, &mut [u8], u32, YuvRange, YuvStandardMatrix) -> Result<(), yuv::YuvError>;
+type PackedToRgb = fn(
+    &YuvPackedImage<'_, u8>,
+    &mut [u8],
+    u32,
+    YuvRange,
+    YuvStandardMatrix,
+) -> Result<(), yuv::YuvError>;
 
 /// 4:2:2 in one plane. Cameras send BT.601 with limited range, which is also what cv_bridge takes it for.
 fn packed_yuv(image: &Image, convert: PackedToRgb) -> Result<Vec<u8>, DecodeError> {
@@ -188,9 +302,21 @@ fn packed_yuv(image: &Image, convert: PackedToRgb) -> Result<Vec<u8>, DecodeErro
     check_size(image, "an even width", |w, _| w % 2 == 0)?;
     let rows = Rows::of(image, u64::from(width) * 2, u64::from(height))?;
     let packed: Vec<u8> = rows.iter().flatten().copied().collect();
-    let yuy = YuvPackedImage { yuy: &packed, yuy_stride: width * 2, width, height };
+    let yuy = YuvPackedImage {
+        yuy: &packed,
+        yuy_stride: width * 2,
+        width,
+        height,
+    };
     let mut pixels = vec![0; width as usize * height as usize * 3];
-    convert(&yuy, &mut pixels, width * 3, YuvRange::Limited, YuvStandardMatrix::Bt601).map_err(|e| refused(image, &e))?;
+    convert(
+        &yuy,
+        &mut pixels,
+        width * 3,
+        YuvRange::Limited,
+        YuvStandardMatrix::Bt601,
+    )
+    .map_err(|e| refused(image, &e))?;
     Ok(pixels)
 }
 
@@ -201,20 +327,40 @@ fn nv12(image: &Image) -> Result<Vec<u8>, DecodeError> {
     let rows = Rows::of(image, u64::from(width), u64::from(height) / 2 * 3)?;
     let packed: Vec<u8> = rows.iter().flatten().copied().collect();
     let (y_plane, uv_plane) = packed.split_at(width as usize * height as usize);
-    let planes = YuvBiPlanarImage { y_plane, y_stride: width, uv_plane, uv_stride: width, width, height };
+    let planes = YuvBiPlanarImage {
+        y_plane,
+        y_stride: width,
+        uv_plane,
+        uv_stride: width,
+        width,
+        height,
+    };
     let mut pixels = vec![0; width as usize * height as usize * 3];
     let mode = YuvConversionMode::Balanced;
-    yuv::yuv_nv12_to_rgb(&planes, &mut pixels, width * 3, YuvRange::Limited, YuvStandardMatrix::Bt601, mode)
-        .map_err(|e| refused(image, &e))?;
+    yuv::yuv_nv12_to_rgb(
+        &planes,
+        &mut pixels,
+        width * 3,
+        YuvRange::Limited,
+        YuvStandardMatrix::Bt601,
+        mode,
+    )
+    .map_err(|e| refused(image, &e))?;
     Ok(pixels)
 }
 
 fn refused(image: &Image, error: &yuv::YuvError) -> DecodeError {
-    DecodeError::Compressed { found_bytes: image.data.len(), reason: error.to_string() }
+    DecodeError::Compressed {
+        found_bytes: image.data.len(),
+        reason: error.to_string(),
+    }
 }
 
 fn bayer(rows: &Rows<'_>, pattern: BayerPattern) -> Vec<u8> {
-    let size = ImageSize { width: rows.row_bytes, height: rows.n_rows };
+    let size = ImageSize {
+        width: rows.row_bytes,
+        height: rows.n_rows,
+    };
     let packed: Vec<u8> = rows.iter().flatten().copied().collect();
     let mosaic = KorniaImage::<u8, 1>::new(size, packed).expect("bytes fit the size");
     let mut picture = KorniaImage::<u8, 3>::from_size_val(size, 0).expect("memory for one picture");

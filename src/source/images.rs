@@ -39,20 +39,36 @@ pub struct ImagesSource {
 
 impl ImagesSource {
     pub fn open(folder: &Path, params: &SourceParams) -> Result<Self, SourceError> {
-        let fail = |reason: String, way_out| SourceError::Open { what: "folder of pictures", reason, way_out, path: folder.to_owned() };
+        let fail = |reason: String, way_out| SourceError::Open {
+            what: "folder of pictures",
+            reason,
+            way_out,
+            path: folder.to_owned(),
+        };
         let list = folder.join("images.txt");
         let entries = if list.exists() {
-            let text = read_text(&list).map_err(|reason| fail(reason, "make images.txt a readable text file"))?;
+            let text = read_text(&list)
+                .map_err(|reason| fail(reason, "make images.txt a readable text file"))?;
             entries_of_list(folder, &text)
         } else {
-            entries_of_folder(folder).map_err(|reason| fail(reason, "name a folder with JPEG or PNG files"))?
+            entries_of_folder(folder)
+                .map_err(|reason| fail(reason, "name a folder with JPEG or PNG files"))?
         };
         if entries.is_empty() {
-            return Err(fail("no pictures".to_owned(), "put JPEG or PNG files in it, or lines `seconds path` in images.txt"));
+            return Err(fail(
+                "no pictures".to_owned(),
+                "put JPEG or PNG files in it, or lines `seconds path` in images.txt",
+            ));
         }
         if !entries.iter().any(|entry| entry.path.is_file()) {
-            let reason = format!("none of the {} pictures that images.txt lists is there", entries.len());
-            return Err(fail(reason, "copy them beside images.txt, or name the recording instead"));
+            let reason = format!(
+                "none of the {} pictures that images.txt lists is there",
+                entries.len()
+            );
+            return Err(fail(
+                reason,
+                "copy them beside images.txt, or name the recording instead",
+            ));
         }
         let stamps: Vec<Stamp> = entries.iter().take(1000).map(|entry| entry.stamp).collect();
         Ok(Self {
@@ -70,10 +86,18 @@ impl ImagesSource {
         match bytes.and_then(|bytes| super::decode::compressed(&bytes).map_err(|e| e.to_string())) {
             Ok(picture) => {
                 let truth = self.truth.nearest(entry.stamp, self.truth_within_nanos);
-                self.intake.frame(arrival, picture, Extras { truth, truth_depth: None })
+                self.intake.frame(
+                    arrival,
+                    picture,
+                    Extras {
+                        truth,
+                        truth_depth: None,
+                    },
+                )
             }
             Err(reason) => {
-                self.intake.undecodable(arrival.seq, &format!("{reason}: {}", entry.path.display()));
+                self.intake
+                    .undecodable(arrival.seq, &format!("{reason}: {}", entry.path.display()));
                 None
             }
         }
@@ -99,13 +123,18 @@ impl Source for ImagesSource {
         let left = self.entries.len() as u64;
         let counts = self.intake.counts();
         let frames_out = counts.received - counts.undecodable - counts.out_of_order;
-        Some(if self.max_frames == 0 { left } else { left.min(self.max_frames.saturating_sub(frames_out)) })
+        Some(if self.max_frames == 0 {
+            left
+        } else {
+            left.min(self.max_frames.saturating_sub(frames_out))
+        })
     }
 }
 
 /// Whether a folder looks like one of pictures.
 pub(super) fn has_pictures(folder: &Path) -> bool {
-    folder.join("images.txt").is_file() || entries_of_folder(folder).is_ok_and(|entries| !entries.is_empty())
+    folder.join("images.txt").is_file()
+        || entries_of_folder(folder).is_ok_and(|entries| !entries.is_empty())
 }
 
 fn read_text(path: &Path) -> Result<String, String> {
@@ -115,17 +144,27 @@ fn read_text(path: &Path) -> Result<String, String> {
 fn entries_of_list(folder: &Path, text: &str) -> Vec<Entry> {
     let mut entries = Vec::new();
     let mut n_bad = 0;
-    for line in text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#')) {
+    for line in text
+        .lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty() && !line.starts_with('#'))
+    {
         let entry = entry_of_line(folder, line);
         n_bad += usize::from(entry.is_none());
         entries.extend(entry);
         if entries.len() >= MAX_PICTURES {
-            tracing::warn!("only the first {MAX_PICTURES} lines of images.txt are read: {}", folder.display());
+            tracing::warn!(
+                "only the first {MAX_PICTURES} lines of images.txt are read: {}",
+                folder.display()
+            );
             break;
         }
     }
     if n_bad > 0 {
-        tracing::warn!("{n_bad} lines of images.txt are not `seconds path-inside-the-folder`: {}", folder.display());
+        tracing::warn!(
+            "{n_bad} lines of images.txt are not `seconds path-inside-the-folder`: {}",
+            folder.display()
+        );
     }
     entries
 }
@@ -134,31 +173,54 @@ fn entry_of_line(folder: &Path, line: &str) -> Option<Entry> {
     let (stamp, name) = line.split_once(char::is_whitespace)?;
     let path = Path::new(name.trim());
     // A list from elsewhere must not make us read whatever else lies on the disk.
-    let stays_inside = path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
-    stays_inside.then_some(Entry { stamp: stamp_of_decimal(stamp)?, path: folder.join(path) })
+    let stays_inside = path
+        .components()
+        .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    stays_inside.then_some(Entry {
+        stamp: stamp_of_decimal(stamp)?,
+        path: folder.join(path),
+    })
 }
 
 fn entries_of_folder(folder: &Path) -> Result<Vec<Entry>, String> {
     let is_picture = |path: &PathBuf| {
-        let extension = path.extension().map(|extension| extension.to_string_lossy().to_ascii_lowercase());
+        let extension = path
+            .extension()
+            .map(|extension| extension.to_string_lossy().to_ascii_lowercase());
         matches!(extension.as_deref(), Some("jpg" | "jpeg" | "png"))
     };
     let found = std::fs::read_dir(folder).map_err(|e| e.to_string())?;
-    let mut paths: Vec<PathBuf> =
-        found.flatten().map(|entry| entry.path()).filter(is_picture).take(MAX_PICTURES).collect();
+    let mut paths: Vec<PathBuf> = found
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(is_picture)
+        .take(MAX_PICTURES)
+        .collect();
     paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
-    let with_stamp = |(ix, path)| Entry { stamp: Stamp::from_nanos(ix as i64 * MADE_UP_GAP_NANOS), path };
+    let with_stamp = |(ix, path)| Entry {
+        stamp: Stamp::from_nanos(ix as i64 * MADE_UP_GAP_NANOS),
+        path,
+    };
     Ok(paths.into_iter().enumerate().map(with_stamp).collect())
 }
 
 fn lens_of(folder: &Path) -> Option<Lens> {
     let path = folder.join("intrinsics.json");
     if !path.exists() {
-        tracing::info!("no intrinsics.json: the camera counts as uncalibrated: {}", folder.display());
+        tracing::info!(
+            "no intrinsics.json: the camera counts as uncalibrated: {}",
+            folder.display()
+        );
         return None;
     }
     let lens = read_text(&path).and_then(|text| lens_of_json(&text));
-    lens.inspect_err(|found| tracing::warn!("camera counts as uncalibrated, found {found}: {}", path.display())).ok()
+    lens.inspect_err(|found| {
+        tracing::warn!(
+            "camera counts as uncalibrated, found {found}: {}",
+            path.display()
+        );
+    })
+    .ok()
 }
 
 fn truth_of(folder: &Path) -> Track {
@@ -174,7 +236,10 @@ fn truth_of(folder: &Path) -> Track {
         }
     };
     if n_bad > 0 || track.is_empty() {
-        tracing::warn!("{n_bad} lines are not `t tx ty tz qx qy qz qw`: {}", path.display());
+        tracing::warn!(
+            "{n_bad} lines are not `t tx ty tz qx qy qz qw`: {}",
+            path.display()
+        );
     }
     track
 }

@@ -87,7 +87,12 @@ impl Intake {
         if self.last_stamp.is_some_and(|last| stamp <= last) {
             self.counts.out_of_order += 1;
             let last = self.last_stamp.unwrap_or_default();
-            self.warn_once("order", &format!("frame {seq} has stamp {stamp}, not later than {last}; such frames are left out"));
+            self.warn_once(
+                "order",
+                &format!(
+                    "frame {seq} has stamp {stamp}, not later than {last}; such frames are left out"
+                ),
+            );
             return None;
         }
         Some(Arrival { seq, stamp })
@@ -96,7 +101,10 @@ impl Intake {
     /// A picture arrived that cannot be used.
     pub fn undecodable(&mut self, seq: u64, reason: &str) {
         self.counts.undecodable += 1;
-        self.warn_once("undecodable", &format!("frame {seq} is left out, and so are others like it: {reason}"));
+        self.warn_once(
+            "undecodable",
+            &format!("frame {seq} is left out, and so are others like it: {reason}"),
+        );
     }
 
     /// A picture arrived of which not even the stamp can be read.
@@ -130,20 +138,31 @@ impl Intake {
             Some(self.shape(&working, arrival, picture, extras))
         } else {
             let (w, h) = working.source_size;
-            self.undecodable(arrival.seq, &format!("it has {}x{} px, the first one {w}x{h} px", size.0, size.1));
+            self.undecodable(
+                arrival.seq,
+                &format!("it has {}x{} px, the first one {w}x{h} px", size.0, size.1),
+            );
             None
         };
         self.working = Some(working);
         frame
     }
 
-    fn shape(&mut self, working: &Working, arrival: Arrival, picture: RgbImage, extras: Extras) -> Frame {
+    fn shape(
+        &mut self,
+        working: &Working,
+        arrival: Arrival,
+        picture: RgbImage,
+        extras: Extras,
+    ) -> Frame {
         let small = self.scaled(picture, working.size);
         let image = match &working.rectifier {
             Some(rectifier) => rectifier.rectify(small),
             None => small,
         };
-        let truth_depth = extras.truth_depth.map(|depth| Arc::new(fit_depth(&depth, working)));
+        let truth_depth = extras
+            .truth_depth
+            .map(|depth| Arc::new(fit_depth(&depth, working)));
         self.last_stamp = Some(arrival.stamp);
         self.n_frames += 1;
         self.wait_for(arrival.stamp);
@@ -159,12 +178,22 @@ impl Intake {
 
     fn prepare(&mut self, source_size: (u32, u32)) -> Working {
         let size = size_within(source_size, self.params.max_side);
-        let plain = |intrinsics| Working { source_size, size, intrinsics, rectifier: None };
-        let Some(lens) = self.lens else { return plain(None) };
+        let plain = |intrinsics| Working {
+            source_size,
+            size,
+            intrinsics,
+            rectifier: None,
+        };
+        let Some(lens) = self.lens else {
+            return plain(None);
+        };
         let lens = match lens_for_size(&lens, source_size.0, source_size.1) {
             Ok(lens) => lens.resized(size.0, size.1),
             Err(found) => {
-                self.warn_once("calibration", &format!("camera counts as uncalibrated: {found}"));
+                self.warn_once(
+                    "calibration",
+                    &format!("camera counts as uncalibrated: {found}"),
+                );
                 return plain(None);
             }
         };
@@ -172,24 +201,43 @@ impl Intake {
             return plain(Some(lens.intrinsics));
         }
         let Some(rectifier) = Rectifier::new(&lens) else {
-            let found = format!("camera counts as uncalibrated: {:?} leaves no usable view", lens.distortion);
+            let found = format!(
+                "camera counts as uncalibrated: {:?} leaves no usable view",
+                lens.distortion
+            );
             self.warn_once("calibration", &found);
             return plain(None);
         };
-        Working { source_size, size, intrinsics: Some(rectifier.pinhole), rectifier: Some(rectifier) }
+        Working {
+            source_size,
+            size,
+            intrinsics: Some(rectifier.pinhole),
+            rectifier: Some(rectifier),
+        }
     }
 
     fn scaled(&mut self, picture: RgbImage, size: (u32, u32)) -> RgbImage {
         if (picture.width_px, picture.height_px) == size {
             return picture;
         }
-        let source = ResizeImage::from_vec_u8(picture.width_px, picture.height_px, picture.pixels, PixelType::U8x3)
-            .expect("three bytes per pixel");
+        let source = ResizeImage::from_vec_u8(
+            picture.width_px,
+            picture.height_px,
+            picture.pixels,
+            PixelType::U8x3,
+        )
+        .expect("three bytes per pixel");
         let mut target = ResizeImage::new(size.0, size.1, PixelType::U8x3);
         // A box filter would move edges by up to half a pixel at ratios that are not whole.
         let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
-        self.resizer.resize(&source, &mut target, &options).expect("both pictures are U8x3");
-        RgbImage { width_px: size.0, height_px: size.1, pixels: target.into_vec() }
+        self.resizer
+            .resize(&source, &mut target, &options)
+            .expect("both pictures are U8x3");
+        RgbImage {
+            width_px: size.0,
+            height_px: size.1,
+            pixels: target.into_vec(),
+        }
     }
 
     /// Holds a frame back until its time has come.
@@ -217,7 +265,9 @@ fn size_within((width, height): (u32, u32), max_side: u32) -> (u32, u32) {
     if longest <= max_side {
         return (width, height);
     }
-    let scaled = |side: u32| ((f64::from(side) * f64::from(max_side) / f64::from(longest)).round() as u32).max(1);
+    let scaled = |side: u32| {
+        ((f64::from(side) * f64::from(max_side) / f64::from(longest)).round() as u32).max(1)
+    };
     (scaled(width), scaled(height))
 }
 
@@ -237,7 +287,10 @@ fn fit_depth(depth: &DepthMap, working: &Working) -> DepthMap {
             let u = (f64::from(x) + 0.5) / f64::from(width_px);
             let v = (f64::from(y) + 0.5) / f64::from(height_px);
             let (u, v) = working.rectifier.as_ref().map_or((u, v), |rectifier| {
-                let at = rectifier.source_of(cell(u * f64::from(width), width) as u32, cell(v * f64::from(height), height) as u32);
+                let at = rectifier.source_of(
+                    cell(u * f64::from(width), width) as u32,
+                    cell(v * f64::from(height), height) as u32,
+                );
                 (at.x / f64::from(width), at.y / f64::from(height))
             });
             let column = cell(u * f64::from(depth.width_px), depth.width_px);

@@ -11,7 +11,9 @@ pub mod rectify;
 pub mod synthetic;
 
 mod bag;
+mod bag_file;
 mod survey;
+mod topics;
 mod truth;
 
 use std::cmp::Ordering;
@@ -49,7 +51,11 @@ pub enum SourceError {
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
     NoImageTopic { found: String, path: PathBuf },
     #[error("{topic:?} carries {found}, expected sensor_msgs/msg/Image or CompressedImage as cdr: {}", path.display())]
-    TopicType { topic: String, found: String, path: PathBuf },
+    TopicType {
+        topic: String,
+        found: String,
+        path: PathBuf,
+    },
     #[error("{uri:?} is not in this build; {way_out}")]
     NotInBuild { uri: String, way_out: &'static str },
 }
@@ -67,17 +73,22 @@ pub trait Source: Send {
 
 /// Opens `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
 pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
-    let not_in_build = |way_out| Err(SourceError::NotInBuild { uri: uri.to_owned(), way_out });
+    let not_in_build = |way_out| {
+        Err(SourceError::NotInBuild {
+            uri: uri.to_owned(),
+            way_out,
+        })
+    };
     match uri.split_once(':') {
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
-        Some(("v4l2" | "webcam", _)) => {
-            not_in_build("record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH")
-        }
-        Some(("ros2" | "zenoh", _)) => {
-            not_in_build("record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH")
-        }
+        Some(("v4l2" | "webcam", _)) => not_in_build(
+            "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
+        ),
+        Some(("ros2" | "zenoh", _)) => not_in_build(
+            "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
+        ),
         _ => open_path(uri, params),
     }
 }
@@ -90,8 +101,14 @@ fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, So
     Ok(Box::new(images::ImagesSource::open(path, params)?))
 }
 
-fn open_synthetic(scene: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
-    Ok(Box::new(synthetic::SyntheticSource::open(scene, params, seed)?))
+fn open_synthetic(
+    scene: &str,
+    params: &SourceParams,
+    seed: u64,
+) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(synthetic::SyntheticSource::open(
+        scene, params, seed,
+    )?))
 }
 
 /// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.
@@ -101,18 +118,28 @@ fn open_path(uri: &str, params: &SourceParams) -> Result<Box<dyn Source>, Source
         return open_mcap(path, params);
     }
     if !path.is_dir() {
-        return Err(SourceError::Uri { uri: uri.to_owned() });
+        return Err(SourceError::Uri {
+            uri: uri.to_owned(),
+        });
     }
     let holds_mcap = |folder: &Path| {
-        let is_mcap = |name: PathBuf| name.extension().is_some_and(|extension| extension == "mcap");
+        let is_mcap = |name: PathBuf| {
+            name.extension()
+                .is_some_and(|extension| extension == "mcap")
+        };
         folder.join("metadata.yaml").is_file()
-            || std::fs::read_dir(folder).is_ok_and(|entries| entries.flatten().any(|entry| is_mcap(entry.path())))
+            || std::fs::read_dir(folder)
+                .is_ok_and(|entries| entries.flatten().any(|entry| is_mcap(entry.path())))
     };
     if holds_mcap(path) {
         return open_mcap(path, params);
     }
     let inner = path.join("rosbag2");
-    let pictures = if images::has_pictures(path) { Some(open_images(path, params)) } else { None };
+    let pictures = if images::has_pictures(path) {
+        Some(open_images(path, params))
+    } else {
+        None
+    };
     match pictures {
         Some(Ok(source)) => Ok(source),
         _ if holds_mcap(&inner) => open_mcap(&inner, params),
@@ -128,11 +155,16 @@ fn read_small(path: &Path, max_bytes: u64) -> Result<Vec<u8>, String> {
         return Err("not a regular file".to_owned());
     }
     if metadata.len() > max_bytes {
-        return Err(format!("a file of {} bytes, at most {max_bytes} are read", metadata.len()));
+        return Err(format!(
+            "a file of {} bytes, at most {max_bytes} are read",
+            metadata.len()
+        ));
     }
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).map_err(|e| e.to_string())?;
-    file.take(max_bytes).read_to_end(&mut bytes).map_err(|e| e.to_string())?;
+    file.take(max_bytes)
+        .read_to_end(&mut bytes)
+        .map_err(|e| e.to_string())?;
     Ok(bytes)
 }
 
@@ -140,28 +172,32 @@ fn read_small(path: &Path, max_bytes: u64) -> Result<Vec<u8>, String> {
 fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a, b);
     loop {
-        let (text_a, text_b) = (head(a, |c| !c.is_ascii_digit()), head(b, |c| !c.is_ascii_digit()));
-        let by_text = text_a.cmp(text_b);
-        if by_text != Ordering::Equal {
-            return by_text;
-        }
-        (a, b) = (&a[text_a.len()..], &b[text_b.len()..]);
-        let (digits_a, digits_b) = (head(a, |c| c.is_ascii_digit()), head(b, |c| c.is_ascii_digit()));
-        let (number_a, number_b) = (digits_a.trim_start_matches('0'), digits_b.trim_start_matches('0'));
-        let by_number = number_a.len().cmp(&number_b.len()).then_with(|| number_a.cmp(number_b));
-        if by_number != Ordering::Equal {
-            return by_number;
-        }
-        (a, b) = (&a[digits_a.len()..], &b[digits_b.len()..]);
-        if a.is_empty() && b.is_empty() {
-            return Ordering::Equal;
-        }
+        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let (char_a, char_b) = (a.chars().next(), b.chars().next());
+        let order = if digits_a.is_empty() || digits_b.is_empty() {
+            char_a.cmp(&char_b)
+        } else {
+            let (number_a, number_b) = (
+                digits_a.trim_start_matches('0'),
+                digits_b.trim_start_matches('0'),
+            );
+            number_a
+                .len()
+                .cmp(&number_b.len())
+                .then_with(|| number_a.cmp(number_b))
+        };
+        let (Ordering::Equal, Some(char_a), Some(char_b)) = (order, char_a, char_b) else {
+            return order;
+        };
+        a = &a[digits_a.len().max(char_a.len_utf8())..];
+        b = &b[digits_b.len().max(char_b.len_utf8())..];
     }
 }
 
-/// The longest beginning whose characters all fit.
-fn head(text: &str, fits: impl Fn(char) -> bool) -> &str {
-    &text[..text.find(|c| !fits(c)).unwrap_or(text.len())]
+fn leading_digits(text: &str) -> &str {
+    &text[..text
+        .find(|c: char| !c.is_ascii_digit())
+        .unwrap_or(text.len())]
 }
 
 #[cfg(test)]
@@ -170,8 +206,27 @@ mod tests {
 
     #[test]
     fn names_sort_as_people_count() {
-        let mut names = ["f10.png", "f9.png", "f1.png", "e99.png", "f010b.png", "f.png", "f9"];
+        let mut names = [
+            "f10.png",
+            "f9.png",
+            "f1.png",
+            "e99.png",
+            "f010b.png",
+            "f.png",
+            "f9",
+        ];
         names.sort_by(|a, b| natural_order(a, b));
-        assert_eq!(names, ["e99.png", "f.png", "f1.png", "f9", "f9.png", "f10.png", "f010b.png"]);
+        assert_eq!(
+            names,
+            [
+                "e99.png",
+                "f.png",
+                "f1.png",
+                "f9",
+                "f9.png",
+                "f10.png",
+                "f010b.png"
+            ]
+        );
     }
 }

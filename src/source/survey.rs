@@ -81,7 +81,11 @@ impl Survey {
     pub(super) fn listing(&self) -> String {
         const MAX_LISTED: usize = 20;
         let describe = |(name, topic): (&String, &Topic)| {
-            let encoding = if topic.is_cdr() { String::new() } else { format!(", encoded as {:?}", topic.message_encoding) };
+            let encoding = if topic.is_cdr() {
+                String::new()
+            } else {
+                format!(", encoded as {:?}", topic.message_encoding)
+            };
             format!("{name} ({}{encoding})", topic.type_name)
         };
         let mut parts: Vec<String> = self.topics.iter().take(MAX_LISTED).map(describe).collect();
@@ -108,7 +112,9 @@ impl Survey {
             };
             self.topics.insert(channel.topic.clone(), topic);
         }
-        let Some(topic) = self.topics.get_mut(&channel.topic) else { return };
+        let Some(topic) = self.topics.get_mut(&channel.topic) else {
+            return;
+        };
         topic.n_messages += 1;
         if !topic.is_cdr() {
             return;
@@ -117,8 +123,12 @@ impl Survey {
             Image::TYPE_NAME | CompressedImage::TYPE_NAME => note_image(topic, message),
             CameraInfo::TYPE_NAME => self.note_info(message),
             PoseStamped::TYPE_NAME => {
-                let Ok(pose) = ros::decode::<PoseStamped>(message.payload) else { return };
-                let Some(world_from_cam) = pose.pose.to_rigid() else { return };
+                let Ok(pose) = ros::decode::<PoseStamped>(message.payload) else {
+                    return;
+                };
+                let Some(world_from_cam) = pose.pose.to_rigid() else {
+                    return;
+                };
                 let track = self.poses.entry(channel.topic.clone()).or_default();
                 self.has_left_out |= !track.insert(pose.header.stamp.into(), world_from_cam);
             }
@@ -134,10 +144,16 @@ impl Survey {
 
     fn note_info(&mut self, message: &Message<'_>) {
         let is_usable = |info: &CameraInfo| lens_of_camera_info(info, false).is_ok();
-        if self.infos.get(&message.channel.topic).is_some_and(is_usable) {
+        if self
+            .infos
+            .get(&message.channel.topic)
+            .is_some_and(is_usable)
+        {
             return;
         }
-        let Ok(info) = ros::decode::<CameraInfo>(message.payload) else { return };
+        let Ok(info) = ros::decode::<CameraInfo>(message.payload) else {
+            return;
+        };
         if is_usable(&info) || !self.infos.contains_key(&message.channel.topic) {
             self.infos.insert(message.channel.topic.clone(), info);
         }
@@ -146,7 +162,9 @@ impl Survey {
 
 fn note_image(topic: &mut Topic, message: &Message<'_>) {
     if topic.stamps.len() < MAX_STAMPS {
-        topic.stamps.extend(header_stamp(message.payload, message.log_nanos));
+        topic
+            .stamps
+            .extend(header_stamp(message.payload, message.log_nanos));
     }
     if !topic.encoding.is_empty() {
         return;
@@ -167,10 +185,20 @@ pub(super) fn header_stamp(payload: &[u8], log_nanos: i64) -> Option<Stamp> {
     let (&sec, rest) = rest.split_first_chunk::<4>()?;
     let (&nanosec, _) = rest.split_first_chunk::<4>()?;
     let time = match endian {
-        0 => ros::Time { sec: i32::from_be_bytes(sec), nanosec: u32::from_be_bytes(nanosec) },
-        1 => ros::Time { sec: i32::from_le_bytes(sec), nanosec: u32::from_le_bytes(nanosec) },
+        0 => ros::Time {
+            sec: i32::from_be_bytes(sec),
+            nanosec: u32::from_be_bytes(nanosec),
+        },
+        1 => ros::Time {
+            sec: i32::from_le_bytes(sec),
+            nanosec: u32::from_le_bytes(nanosec),
+        },
         _ => return None,
     };
     let stamp = Stamp::from(time);
-    Some(if stamp.nanos == 0 { Stamp::from_nanos(log_nanos) } else { stamp })
+    Some(if stamp.nanos == 0 {
+        Stamp::from_nanos(log_nanos)
+    } else {
+        stamp
+    })
 }

@@ -54,7 +54,7 @@ pub(crate) fn keyframe(
         truth: None,
         truth_depth: None,
     };
-    Arc::new(Keyframe { id, frame })
+    Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
 }
 
 pub(crate) fn intrinsics(folder: &Path) -> Intrinsics {
@@ -92,9 +92,9 @@ pub(crate) struct Figures {
 }
 
 /// Batches of 8 that share 3, as the node makes them, then the end.
-pub(crate) fn run(shown: &Shown, max_side: u32) -> Figures {
+pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let mut settings = Settings::shipped();
-    settings.set("sfm.max_side", max_side.into()).unwrap();
+    changes.iter().for_each(|change| settings.merge_setting(change).unwrap());
     let params = settings.params().unwrap();
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
     let mut poses = std::collections::BTreeMap::new();
@@ -122,11 +122,8 @@ pub(crate) fn run(shown: &Shown, max_side: u32) -> Figures {
     let secs = watch.secs();
     let components: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
     let largest = components.iter().max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
-    let pairs: Vec<(Rigid, Rigid)> = poses
-        .iter()
-        .filter(|(_, p)| Some(&p.0) == largest)
-        .map(|(id, p)| (shown.truth[*id as usize], p.1))
-        .collect();
+    let pairs: Vec<(Rigid, Rigid)> =
+        poses.iter().filter(|(_, p)| Some(&p.0) == largest).map(|(id, p)| (shown.truth[*id as usize], p.1)).collect();
     let (ate_percent, rotation_deg) = errors(&pairs);
     Figures {
         registered: pairs.len(),
@@ -178,7 +175,7 @@ fn errors(pairs: &[(Rigid, Rigid)]) -> (f64, f64) {
 #[test]
 fn fox_is_registered_whole_in_one_frame() {
     let Some(folder) = scene("fox") else { return };
-    let figures = run(&shown(&folder, 480, 1, true), 480);
+    let figures = run(&shown(&folder, 480, 1, true), &["sfm.max_side=480"]);
     eprintln!("fox: {figures:?}");
     assert!(figures.registered >= 48 && figures.components == 1, "{figures:?}");
     assert!(figures.ate_percent <= 0.3 && figures.rotation_deg <= 0.5, "{figures:?}");
@@ -187,7 +184,7 @@ fn fox_is_registered_whole_in_one_frame() {
 #[test]
 fn a_camera_at_rest_places_nothing_and_says_why() {
     let Some(folder) = scene("static_euroc") else { return };
-    let figures = run(&shown(&folder, 640, 2, true), 640);
+    let figures = run(&shown(&folder, 640, 2, true), &[]);
     assert_eq!(figures.registered, 0, "{figures:?}");
     assert!(figures.note.as_ref().is_some_and(|n| n.contains(NO_PARALLAX)), "{figures:?}");
 }

@@ -65,9 +65,17 @@ fn alike(scene: &Scene, shot_ix: usize, pool: usize) -> Vec<usize> {
 
 fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, seed: u64) {
     let wide = Wide::new(&scene.shots[shot_ix].features.descriptors);
+    // The first component settles the focal length; from then on the stricter check is possible.
+    let focal_known = !scene.components.is_empty();
     let compare = |&other: &usize| {
         let raw = matches(&Wide::new(&scene.shots[other].features.descriptors), &wide);
-        let link = verified(&scene.shots[other], &scene.shots[shot_ix], &raw, max_error_px, pair_seed(seed, other, shot_ix));
+        let link = verified(
+            &scene.shots[other],
+            &scene.shots[shot_ix],
+            &raw,
+            focal_known,
+            (max_error_px, pair_seed(seed, other, shot_ix)),
+        );
         link.map(|link| (other, link))
     };
     let found: Vec<(usize, Link)> = others.par_iter().filter_map(compare).collect();
@@ -96,12 +104,18 @@ pub(super) fn pixel_pairs(a: &Shot, b: &Shot, matches: &[(u32, u32)]) -> Vec<(DV
     matches.iter().map(|&(i, j)| (a.features.pixels[i as usize], b.features.pixels[j as usize])).collect()
 }
 
-fn verified(a: &Shot, b: &Shot, raw: &[(u32, u32)], max_error_px: f64, seed: u64) -> Option<Link> {
+fn verified(
+    a: &Shot,
+    b: &Shot,
+    raw: &[(u32, u32)],
+    focal_known: bool,
+    (max_error_px, seed): (f64, u64),
+) -> Option<Link> {
     if raw.len() < MIN_LINK {
         return None;
     }
     let pairs = pixel_pairs(a, b, raw);
-    let (inliers, motion) = if a.is_calibrated && b.is_calibrated {
+    let (inliers, motion) = if focal_known || (a.is_calibrated && b.is_calibrated) {
         let found = motion(&pairs, [&a.lens, &b.lens], max_error_px, seed)?;
         (found.inliers, Some((found.second_from_first, found.parallax_deg)))
     } else {

@@ -11,8 +11,8 @@ const CHUNK: usize = 512;
 /// Pairs of splat and tile that a picture may have; 8 bytes each here, more in the gradients. A sane map needs
 /// fewer than a hundredth. Beyond, the farthest splats are left out and counted.
 const MAX_PAIRS: u64 = 1 << 26;
-/// Slack of the exact test, in units of the exponent: rounding must never cut a visible pixel.
-const CUT_SLACK: f32 = 0.01;
+/// Slack of the exact tests, in units of the exponent: rounding must not cut a visible pixel.
+pub(crate) const CUT_SLACK: f32 = 0.05;
 
 /// Splats per tile. A splat in a tile is an instance.
 #[derive(Debug, Default)]
@@ -63,7 +63,12 @@ fn sort_by_depth(visible: &[ProjectedSplat], out: &mut Tiles) {
     const DIGIT_BITS: u32 = 11;
     out.order.clear();
     // Depths are positive, so that their bits order as they do.
-    out.order.extend(visible.iter().enumerate().map(|(ix, s)| u64::from(s.depth.to_bits()) << 32 | ix as u64));
+    out.order.extend(
+        visible
+            .iter()
+            .enumerate()
+            .map(|(ix, s)| u64::from(s.depth.to_bits()) << 32 | ix as u64),
+    );
     out.order_scratch.clear();
     out.order_scratch.resize(visible.len(), 0);
     for pass in 0..3 {
@@ -99,20 +104,24 @@ fn leave_out_farthest(visible: &[ProjectedSplat], out: &mut Tiles) {
 
 fn find_hits(visible: &[ProjectedSplat], out: &mut Tiles) {
     let (order, n_x) = (&out.order, out.n_x);
-    out.hits.resize_with(order.len().div_ceil(CHUNK), Hits::default);
-    out.hits.par_iter_mut().zip(order.par_chunks(CHUNK)).for_each(|(hits, keys)| {
-        hits.tiles.clear();
-        hits.ends.clear();
-        for &key in keys {
-            let splat = &visible[visible_ix(key)];
-            let [x0, y0, x1, y1] = splat.tiles.map(usize::from);
-            for y in y0..y1 {
-                let touched = (x0..x1).filter(|&x| touches(splat, x, y));
-                hits.tiles.extend(touched.map(|x| (y * n_x + x) as u32));
+    out.hits
+        .resize_with(order.len().div_ceil(CHUNK), Hits::default);
+    out.hits
+        .par_iter_mut()
+        .zip(order.par_chunks(CHUNK))
+        .for_each(|(hits, keys)| {
+            hits.tiles.clear();
+            hits.ends.clear();
+            for &key in keys {
+                let splat = &visible[visible_ix(key)];
+                let [x0, y0, x1, y1] = splat.tiles.map(usize::from);
+                for y in y0..y1 {
+                    let touched = (x0..x1).filter(|&x| touches(splat, x, y));
+                    hits.tiles.extend(touched.map(|x| (y * n_x + x) as u32));
+                }
+                hits.ends.push(hits.tiles.len() as u32);
             }
-            hits.ends.push(hits.tiles.len() as u32);
-        }
-    });
+        });
 }
 
 /// Whether the ellipse of alpha = `MIN_ALPHA` reaches a pixel centre's bounds in the tile: minimum of the convex
@@ -129,8 +138,7 @@ fn touches(splat: &ProjectedSplat, tile_x: usize, tile_y: usize) -> bool {
     // The minimum lies on an edge that faces the centre; along it the exponent is a parabola.
     let on_vertical = exponent(near_x, (-b * near_x / c).max(y0).min(y1));
     let on_horizontal = exponent((-b * near_y / a).max(x0).min(x1), near_y);
-    // Written so that NaN counts as touching.
-    !(on_vertical.min(on_horizontal) > splat.cut + CUT_SLACK)
+    on_vertical.min(on_horizontal) <= splat.cut + CUT_SLACK
 }
 
 fn count(out: &mut Tiles) {

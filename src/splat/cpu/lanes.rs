@@ -26,7 +26,7 @@ pub(crate) fn exp2<const FMA: bool>(x: f32) -> f32 {
     let p = madd::<FMA>(f, 1.540_353e-4, 1.333_355_8e-3);
     let p = madd::<FMA>(f, p, 9.618_129e-3);
     let p = madd::<FMA>(f, p, 5.550_411e-2);
-    let p = madd::<FMA>(f, p, 2.402_265_1e-1);
+    let p = madd::<FMA>(f, p, 2.402_265e-1);
     let p = madd::<FMA>(f, p, std::f32::consts::LN_2);
     let p = madd::<FMA>(f, p, 1.0);
     f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
@@ -42,7 +42,10 @@ mod tests {
             let x = -126.0 + 127.0 * i as f32 / 200_000.0;
             let expected = f64::from(x).exp2();
             for found in [exp2::<true>(x), exp2::<false>(x)] {
-                assert!((f64::from(found) / expected - 1.0).abs() < 3e-7, "2^{x}: {found}, expected {expected}");
+                assert!(
+                    (f64::from(found) / expected - 1.0).abs() < 3e-7,
+                    "2^{x}: {found}, expected {expected}"
+                );
             }
         }
     }

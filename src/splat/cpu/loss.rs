@@ -54,11 +54,18 @@ struct Scratch {
     /// p, q, r blurred along rows.
     blurred: [Vec<f32>; 3],
     row_sums: Vec<[f64; 2]>,
+    /// Column of the depth map that each pixel of a row takes.
+    map_columns: Vec<usize>,
     zeros: Vec<f32>,
 }
 
 /// Compares the rendering with the photo. Fills `out` with the gradient.
-pub fn loss(raster: &Raster, target: &Target<'_>, settings: &StepSettings, out: &mut PixelGradients) -> LossValue {
+pub fn loss(
+    raster: &Raster,
+    target: &Target<'_>,
+    settings: &StepSettings,
+    out: &mut PixelGradients,
+) -> LossValue {
     out.resize(raster);
     let n = 3.0 * (raster.width_px * raster.height_px) as f64;
     if n == 0.0 {
@@ -74,7 +81,9 @@ pub fn loss(raster: &Raster, target: &Target<'_>, settings: &StepSettings, out: 
         value.l1 += photo_gradient(raster, channel, weights, out) / n;
     }
     value.depth = match target.depth {
-        Some(depth) if settings.depth_weight > 0.0 => depth_gradient(raster, depth, settings.depth_weight, out),
+        Some(depth) if settings.depth_weight > 0.0 => {
+            depth_gradient(raster, depth, settings.depth_weight, out)
+        }
         _ => {
             out.planes[3].fill(0.0);
             out.planes[4].fill(0.0);
@@ -88,19 +97,25 @@ pub fn loss(raster: &Raster, target: &Target<'_>, settings: &StepSettings, out: 
 
 fn load_target(image: &RgbImage, channel: usize, raster: &Raster, scratch: &mut Scratch) {
     let width = raster.width_px;
-    let rows = scratch.target.par_chunks_mut(raster.stride).with_min_len(ROWS_PER_TASK);
-    rows.zip(image.pixels.par_chunks(3 * width)).for_each(|(out, pixels)| {
-        let (pixels, _) = pixels.as_chunks::<3>();
-        for (out, pixel) in out[PLANE_MARGIN..].iter_mut().zip(pixels) {
-            *out = f32::from(pixel[channel]) * (1.0 / 255.0);
-        }
-    });
+    let rows = scratch
+        .target
+        .par_chunks_mut(raster.stride)
+        .with_min_len(ROWS_PER_TASK);
+    rows.zip(image.pixels.par_chunks(3 * width))
+        .for_each(|(out, pixels)| {
+            let (pixels, _) = pixels.as_chunks::<3>();
+            for (out, pixel) in out[PLANE_MARGIN..].iter_mut().zip(pixels) {
+                *out = f32::from(pixel[channel]) * (1.0 / 255.0);
+            }
+        });
 }
 
 fn blur_moments(raster: &Raster, channel: usize, scratch: &mut Scratch) {
     let (stride, width) = (raster.stride, raster.width_px);
     let [x, y, xx, yy, xy] = &mut scratch.moments;
-    let inputs = raster.planes[channel].par_chunks(stride).zip(scratch.target.par_chunks(stride));
+    let inputs = raster.planes[channel]
+        .par_chunks(stride)
+        .zip(scratch.target.par_chunks(stride));
     let outputs = (
         x.par_chunks_mut(width),
         y.par_chunks_mut(width),
@@ -108,21 +123,31 @@ fn blur_moments(raster: &Raster, channel: usize, scratch: &mut Scratch) {
         yy.par_chunks_mut(width),
         xy.par_chunks_mut(width),
     );
-    inputs.zip(outputs.into_par_iter()).with_min_len(ROWS_PER_TASK).for_each(|((rendered, photo), out)| {
-        let rendered = ssim::shifted(&rendered[PLANE_MARGIN - REACH..], width);
-        let photo = ssim::shifted(&photo[PLANE_MARGIN - REACH..], width);
-        ssim::blur(&rendered, out.0);
-        ssim::blur(&photo, out.1);
-        ssim::blur_product(&rendered, &rendered, out.2);
-        ssim::blur_product(&photo, &photo, out.3);
-        ssim::blur_product(&rendered, &photo, out.4);
-    });
+    inputs
+        .zip(outputs.into_par_iter())
+        .with_min_len(ROWS_PER_TASK)
+        .for_each(|((rendered, photo), out)| {
+            let rendered = ssim::shifted(&rendered[PLANE_MARGIN - REACH..], width);
+            let photo = ssim::shifted(&photo[PLANE_MARGIN - REACH..], width);
+            ssim::blur(&rendered, out.0);
+            ssim::blur(&photo, out.1);
+            ssim::blur_product(&rendered, &rendered, out.2);
+            ssim::blur_product(&photo, &photo, out.3);
+            ssim::blur_product(&rendered, &photo, out.4);
+        });
 }
 
 /// Finishes the blur of the moments, and starts the one of the derivatives. Returns the sum of SSIM.
 fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
     let (stride, width) = (raster.stride, raster.width_px);
-    let Scratch { moments, terms: [p, q, r, s, spare], blurred: [bp, bq, br], row_sums, zeros, .. } = scratch;
+    let Scratch {
+        moments,
+        terms: [p, q, r, s, spare],
+        blurred: [bp, bq, br],
+        row_sums,
+        zeros,
+        ..
+    } = scratch;
     let rows = (
         p.par_chunks_mut(stride),
         q.par_chunks_mut(stride),
@@ -134,39 +159,67 @@ fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
         br.par_chunks_mut(width),
         row_sums.par_iter_mut(),
     );
-    rows.into_par_iter().with_min_len(ROWS_PER_TASK).enumerate().for_each(|(y, (p, q, r, s, spare, bp, bq, br, sum))| {
-        let mut rows = [p, q, r, s, spare];
-        for (row, moment) in rows.iter_mut().zip(&*moments) {
-            ssim::blur(&window(moment, y, width, zeros), &mut row[PLANE_MARGIN..][..width]);
-        }
-        {
-            let [p, q, r, s, spare] = rows.each_mut().map(|row| &mut row[PLANE_MARGIN..][..width]);
-            ssim::terms_in_place(p, q, r, s, spare);
-            sum[0] = sum_of(s);
-        }
-        for (row, out) in rows.iter().zip([bp, bq, br]) {
-            ssim::blur(&ssim::shifted(&row[PLANE_MARGIN - REACH..], width), out);
-        }
-    });
+    rows.into_par_iter()
+        .with_min_len(ROWS_PER_TASK)
+        .enumerate()
+        .for_each(|(y, (p, q, r, s, spare, bp, bq, br, sum))| {
+            let mut rows = [p, q, r, s, spare];
+            for (row, moment) in rows.iter_mut().zip(&*moments) {
+                ssim::blur(
+                    &window(moment, y, width, zeros),
+                    &mut row[PLANE_MARGIN..][..width],
+                );
+            }
+            {
+                let [p, q, r, s, spare] =
+                    rows.each_mut().map(|row| &mut row[PLANE_MARGIN..][..width]);
+                ssim::terms_in_place(p, q, r, s, spare);
+                sum[0] = sum_of(s);
+            }
+            for (row, out) in rows.iter().zip([bp, bq, br]) {
+                ssim::blur(&ssim::shifted(&row[PLANE_MARGIN - REACH..], width), out);
+            }
+        });
     row_sums.iter().map(|sums| sums[0]).sum()
 }
 
 /// Returns the sum of absolute differences.
-fn photo_gradient(raster: &Raster, channel: usize, weights: [f32; 2], out: &mut PixelGradients) -> f64 {
+fn photo_gradient(
+    raster: &Raster,
+    channel: usize,
+    weights: [f32; 2],
+    out: &mut PixelGradients,
+) -> f64 {
     let (stride, width) = (raster.stride, raster.width_px);
-    let Scratch { target, blurred: [p, q, r], row_sums, zeros, .. } = &mut out.scratch;
-    let rows = out.planes[channel].par_chunks_mut(stride).zip(row_sums.par_iter_mut());
-    rows.with_min_len(ROWS_PER_TASK).enumerate().for_each(|(y, (out, sum))| {
-        let rendered = raster.row(channel, y);
-        let photo = &target[y * stride + PLANE_MARGIN..][..width];
-        let terms = Terms {
-            p: window(p, y, width, zeros),
-            q: window(q, y, width, zeros),
-            r: window(r, y, width, zeros),
-        };
-        ssim::gradient_row(&terms, rendered, photo, weights, &mut out[PLANE_MARGIN..][..width]);
-        sum[0] = sum_of_differences(rendered, photo);
-    });
+    let Scratch {
+        target,
+        blurred: [p, q, r],
+        row_sums,
+        zeros,
+        ..
+    } = &mut out.scratch;
+    let rows = out.planes[channel]
+        .par_chunks_mut(stride)
+        .zip(row_sums.par_iter_mut());
+    rows.with_min_len(ROWS_PER_TASK)
+        .enumerate()
+        .for_each(|(y, (out, sum))| {
+            let rendered = raster.row(channel, y);
+            let photo = &target[y * stride + PLANE_MARGIN..][..width];
+            let terms = Terms {
+                p: window(p, y, width, zeros),
+                q: window(q, y, width, zeros),
+                r: window(r, y, width, zeros),
+            };
+            ssim::gradient_row(
+                &terms,
+                rendered,
+                photo,
+                weights,
+                &mut out[PLANE_MARGIN..][..width],
+            );
+            sum[0] = sum_of_differences(rendered, photo);
+        });
     row_sums.iter().map(|sums| sums[0]).sum()
 }
 
@@ -174,7 +227,10 @@ fn photo_gradient(raster: &Raster, channel: usize, weights: [f32; 2], out: &mut 
 fn window<'a>(plane: &'a [f32], y: usize, width: usize, zeros: &'a [f32]) -> Window<'a> {
     let mut window = [zeros; TAPS];
     for (t, row) in window.iter_mut().enumerate() {
-        if let Some(inside) = (y + t).checked_sub(REACH).and_then(|y| plane.get(y * width..(y + 1) * width)) {
+        if let Some(inside) = (y + t)
+            .checked_sub(REACH)
+            .and_then(|y| plane.get(y * width..(y + 1) * width))
+        {
             *row = inside;
         }
     }
@@ -183,47 +239,84 @@ fn window<'a>(plane: &'a [f32], y: usize, width: usize, zeros: &'a [f32]) -> Win
 
 /// Returns the depth loss before its weight.
 fn depth_gradient(raster: &Raster, map: &DepthMap, weight: f32, out: &mut PixelGradients) -> f64 {
-    let row_sums = &mut out.scratch.row_sums;
-    row_sums.par_iter_mut().with_min_len(ROWS_PER_TASK).enumerate().for_each(|(y, sums)| {
-        let targets = (0..raster.width_px).filter_map(|x| depth_target(raster, map, x, y));
-        *sums = [targets.map(|(_, confidence)| f64::from(confidence)).sum(), 0.0];
-    });
-    let confidence_sum = row_sums.iter().map(|sums| sums[0]).sum::<f64>().max(MIN_CONFIDENCE_SUM);
+    let Scratch {
+        row_sums,
+        map_columns,
+        ..
+    } = &mut out.scratch;
+    let map_width = map.width_px as usize;
+    map_columns.clear();
+    // floor((x + 0.5) * map_width / width) in integers.
+    map_columns
+        .extend((0..raster.width_px).map(|x| (2 * x + 1) * map_width / (2 * raster.width_px)));
+    let map_columns = &*map_columns;
+    row_sums
+        .par_iter_mut()
+        .with_min_len(ROWS_PER_TASK)
+        .enumerate()
+        .for_each(|(y, sums)| {
+            let confidences = depth_targets(raster, map, map_columns, y).flatten();
+            *sums = [
+                confidences
+                    .map(|(_, confidence)| f64::from(confidence))
+                    .sum(),
+                0.0,
+            ];
+        });
+    let confidence_sum = row_sums
+        .iter()
+        .map(|sums| sums[0])
+        .sum::<f64>()
+        .max(MIN_CONFIDENCE_SUM);
     let scale = (f64::from(weight) / confidence_sum) as f32;
     let [.., alpha_plane, depth_plane] = &mut out.planes;
-    let rows = (alpha_plane.par_chunks_mut(raster.stride), depth_plane.par_chunks_mut(raster.stride), row_sums.par_iter_mut());
-    rows.into_par_iter().with_min_len(ROWS_PER_TASK).enumerate().for_each(|(y, (v_alpha, v_depth_sum, sums))| {
+    let rows = (
+        alpha_plane.par_chunks_mut(raster.stride),
+        depth_plane.par_chunks_mut(raster.stride),
+        row_sums.par_iter_mut(),
+    );
+    let rows = rows.into_par_iter().with_min_len(ROWS_PER_TASK).enumerate();
+    rows.for_each(|(y, (v_alpha, v_depth_sum, sums))| {
+        v_alpha.fill(0.0);
+        v_depth_sum.fill(0.0);
         let (alpha, depth_sum) = (raster.row(3, y), raster.row(4, y));
-        for x in 0..raster.width_px {
-            let (mut v_a, mut v_d) = (0.0, 0.0);
-            if let Some((target, confidence)) = depth_target(raster, map, x, y)
-                && alpha[x] > MIN_ALPHA_FOR_DEPTH
-            {
-                let depth = depth_sum[x] / alpha[x];
-                let error = target / depth - 1.0;
-                let (huber, slope) = huber(error);
-                sums[1] += f64::from(confidence) * f64::from(huber);
-                let v_depth = -scale * confidence * slope * target / (depth * depth);
-                v_d = v_depth / alpha[x];
-                v_a = -v_depth * depth / alpha[x];
+        for (x, target) in depth_targets(raster, map, map_columns, y).enumerate() {
+            let Some((target, confidence)) = target else {
+                continue;
+            };
+            if alpha[x] <= MIN_ALPHA_FOR_DEPTH {
+                continue;
             }
-            v_alpha[PLANE_MARGIN + x] = v_a;
-            v_depth_sum[PLANE_MARGIN + x] = v_d;
+            let depth = depth_sum[x] / alpha[x];
+            let (huber, slope) = huber(target / depth - 1.0);
+            sums[1] += f64::from(confidence) * f64::from(huber);
+            let v_depth = -scale * confidence * slope * target / (depth * depth);
+            v_depth_sum[PLANE_MARGIN + x] = v_depth / alpha[x];
+            v_alpha[PLANE_MARGIN + x] = -v_depth * depth / alpha[x];
         }
     });
     row_sums.iter().map(|sums| sums[1]).sum::<f64>() / confidence_sum
 }
 
-/// Depth and confidence wanted at a pixel, nearest neighbour.
-fn depth_target(raster: &Raster, map: &DepthMap, x: usize, y: usize) -> Option<(f32, f32)> {
+/// Depth and confidence wanted at the pixels of a row, nearest neighbour.
+fn depth_targets<'a>(
+    raster: &Raster,
+    map: &'a DepthMap,
+    map_columns: &'a [usize],
+    y: usize,
+) -> impl Iterator<Item = Option<(f32, f32)>> + 'a {
     let (map_width, map_height) = (map.width_px as usize, map.height_px as usize);
-    // floor((x + 0.5) * map_width / width) in integers.
-    let map_x = (2 * x + 1) * map_width / (2 * raster.width_px);
     let map_y = (2 * y + 1) * map_height / (2 * raster.height_px);
-    let ix = map_y * map_width + map_x;
-    let (depth, confidence) = (*map.depth.get(ix)?, *map.confidence.get(ix)?);
-    let is_usable = depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
-    is_usable.then_some((depth, confidence))
+    let row = map_y * map_width..(map_y + 1) * map_width;
+    // Empty when the map is shorter than it says.
+    let depths = map.depth.get(row.clone()).unwrap_or_default();
+    let confidences = map.confidence.get(row).unwrap_or_default();
+    map_columns.iter().map(|&x| {
+        let (depth, confidence) = (*depths.get(x)?, *confidences.get(x)?);
+        let is_usable =
+            depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
+        is_usable.then_some((depth, confidence))
+    })
 }
 
 /// Value and slope.
@@ -254,7 +347,10 @@ fn sum_of_differences(a: &[f32], b: &[f32]) -> f64 {
             sums[i] += (a[i] - b[i]).abs();
         }
     }
-    let rest = a_rest.iter().zip(b_rest).map(|(a, b)| f64::from((a - b).abs()));
+    let rest = a_rest
+        .iter()
+        .zip(b_rest)
+        .map(|(a, b)| f64::from((a - b).abs()));
     sums.iter().map(|&x| f64::from(x)).sum::<f64>() + rest.sum::<f64>()
 }
 
@@ -270,8 +366,15 @@ impl PixelGradients {
         }
         scratch.stride = raster.stride;
         scratch.target.resize(n_padded, 0.0);
-        scratch.terms.iter_mut().for_each(|t| t.resize(n_padded, 0.0));
-        scratch.moments.iter_mut().chain(&mut scratch.blurred).for_each(|m| m.resize(n_pixels, 0.0));
+        scratch
+            .terms
+            .iter_mut()
+            .for_each(|t| t.resize(n_padded, 0.0));
+        scratch
+            .moments
+            .iter_mut()
+            .chain(&mut scratch.blurred)
+            .for_each(|m| m.resize(n_pixels, 0.0));
         scratch.row_sums.resize(raster.height_px, [0.0; 2]);
         scratch.zeros.resize(raster.width_px, 0.0);
         self.planes.iter_mut().for_each(|p| p.resize(n_padded, 0.0));

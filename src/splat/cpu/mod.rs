@@ -15,7 +15,7 @@ pub mod raster_backward;
 mod sh;
 mod ssim;
 
-use adam::{Attribute, Correction, Moments};
+use adam::{Optimiser, retain_rows};
 use bin::Tiles;
 use loss::{LossValue, PixelGradients, Target};
 use pose_adam::PoseAdam;
@@ -40,6 +40,7 @@ pub struct CpuEngine {
     pass: Pass,
     stats: StepStats,
     n_skipped_updates: u64,
+    n_left_out: u64,
 }
 
 /// Gradient of one view's loss, for tests and diagnosis. Arrays as in `Splats`, 0 where a splat is not visible.
@@ -67,19 +68,6 @@ pub struct Gradients {
 struct View {
     view: TrainingView,
     adam: PoseAdam,
-}
-
-/// Adam's state, in the layout of `Splats`.
-#[derive(Debug, Default)]
-struct Optimiser {
-    means: Moments,
-    log_scales: Moments,
-    quats: Moments,
-    opacity_logits: Moments,
-    sh: Moments,
-    /// Updates that each splat has had.
-    ages: Vec<u32>,
-    corrections: Vec<Correction>,
 }
 
 /// Buffers of one way there and back.
@@ -117,7 +105,8 @@ pub fn gradients(splats: &Splats, view: &TrainingView, settings: &StepSettings) 
         out.log_scales[ix] = g.log_scales[v];
         out.quats[ix] = g.quats[v];
         out.opacity_logits[ix] = g.opacity_logits[v];
-        out.sh[ix * splats.sh_stride()..][..g.sh_stride].copy_from_slice(&g.sh[v * g.sh_stride..][..g.sh_stride]);
+        out.sh[ix * splats.sh_stride()..][..g.sh_stride]
+            .copy_from_slice(&g.sh[v * g.sh_stride..][..g.sh_stride]);
     }
     out
 }
@@ -132,17 +121,31 @@ impl CpuEngine {
         self.n_skipped_updates
     }
 
-    fn count_skipped(&mut self, n: usize) {
-        if n > 0 && self.n_skipped_updates == 0 {
-            tracing::warn!("{n} gradients are not finite: their splats or poses are not updated; said once, counted on");
+    /// Warns of what went wrong in a step, once of each kind.
+    fn count_troubles(&mut self, n_skipped: usize) {
+        if n_skipped > 0 && self.n_skipped_updates == 0 {
+            tracing::warn!(
+                "{n_skipped} gradients are not finite: their splats or poses are not updated; said once"
+            );
         }
-        self.n_skipped_updates += n as u64;
+        self.n_skipped_updates += n_skipped as u64;
+        let n_left_out = self.pass.tiles.n_left_out;
+        if n_left_out > 0 && self.n_left_out == 0 {
+            tracing::warn!(
+                "splats are too large: the {n_left_out} farthest of a view are left out; said once"
+            );
+        }
+        self.n_left_out += n_left_out as u64;
     }
 }
 
 impl Engine for CpuEngine {
     fn adapter(&self) -> String {
-        format!("cpu ({} threads, {})", rayon::current_num_threads(), instruction_set())
+        format!(
+            "cpu ({} threads, {})",
+            rayon::current_num_threads(),
+            instruction_set()
+        )
     }
 
     fn append(&mut self, splats: &Splats) {
@@ -150,7 +153,10 @@ impl Engine for CpuEngine {
         if self.splats.is_empty() {
             self.splats.sh_degree = splats.sh_degree;
         }
-        assert_eq!(self.splats.sh_degree, splats.sh_degree, "all splats of an engine have one SH degree");
+        assert_eq!(
+            self.splats.sh_degree, splats.sh_degree,
+            "all splats of an engine have one SH degree"
+        );
         let all = &mut self.splats;
         all.means.extend_from_slice(&splats.means);
         all.log_scales.extend_from_slice(&splats.log_scales);
@@ -171,16 +177,16 @@ impl Engine for CpuEngine {
         retain_rows(&mut all.opacity_logits, 1, keep);
         retain_rows(&mut all.sh, sh_stride, keep);
         retain_rows(&mut all.anchors, 1, keep);
-        retain_rows(&mut self.optimiser.ages, 1, keep);
-        for (moments, stride) in self.optimiser.moments_mut(sh_stride) {
-            retain_rows(&mut moments.first, stride, keep);
-            retain_rows(&mut moments.second, stride, keep);
-        }
+        self.optimiser.retain(sh_stride, keep);
     }
 
     fn overwrite(&mut self, splats: &Splats) {
         splats.assert_consistent();
-        assert_eq!((splats.len(), splats.sh_degree), (self.splats.len(), self.splats.sh_degree), "same splats, new numbers");
+        assert_eq!(
+            (splats.len(), splats.sh_degree),
+            (self.splats.len(), self.splats.sh_degree),
+            "same splats, new numbers"
+        );
         self.splats.clone_from(splats);
     }
 
@@ -191,9 +197,20 @@ impl Engine for CpuEngine {
     fn add_view(&mut self, view: TrainingView) -> usize {
         let (image, intrinsics) = (&view.image, &view.intrinsics);
         let size = (image.width_px, image.height_px);
-        assert_eq!(size, (intrinsics.width_px, intrinsics.height_px), "a view's intrinsics are those of its image");
-        assert_eq!(image.pixels.len(), 3 * size.0 as usize * size.1 as usize, "an image is as large as it says");
-        self.views.push(View { view, adam: PoseAdam::default() });
+        assert_eq!(
+            size,
+            (intrinsics.width_px, intrinsics.height_px),
+            "a view's intrinsics are those of its image"
+        );
+        assert_eq!(
+            image.pixels.len(),
+            3 * size.0 as usize * size.1 as usize,
+            "an image is as large as it says"
+        );
+        self.views.push(View {
+            view,
+            adam: PoseAdam::default(),
+        });
         self.views.len() - 1
     }
 
@@ -220,33 +237,58 @@ impl Engine for CpuEngine {
         let mut n_skipped = 0;
         if settings.train_pose {
             let rates = [settings.lr_pose_translation, settings.lr_pose_rotation];
-            match view.adam.update(&view.view.cam_from_map, self.pass.gradients.pose, rates) {
+            match view
+                .adam
+                .update(&view.view.cam_from_map, self.pass.gradients.pose, rates)
+            {
                 Some(pose) => view.view.cam_from_map = pose,
                 None => n_skipped += 1,
             }
         }
         if settings.train_splats {
-            n_skipped += self.optimiser.update(&mut self.splats, &self.pass, settings);
+            n_skipped += self.optimiser.update(
+                &mut self.splats,
+                &self.pass.projected,
+                &self.pass.gradients,
+                settings,
+            );
         }
-        self.count_skipped(n_skipped);
+        self.count_troubles(n_skipped);
     }
 
     fn take_stats(&mut self) -> StepStats {
         let sums = std::mem::take(&mut self.stats);
         let n = sums.n_steps.max(1) as f64;
-        StepStats { n_steps: sums.n_steps, loss: sums.loss / n, l1: sums.l1 / n, ssim: sums.ssim / n }
+        StepStats {
+            n_steps: sums.n_steps,
+            loss: sums.loss / n,
+            l1: sums.l1 / n,
+            ssim: sums.ssim / n,
+        }
     }
 
     fn poses(&mut self) -> Vec<Rigid> {
-        self.views.iter().map(|view| view.view.cam_from_map).collect()
+        self.views
+            .iter()
+            .map(|view| view.view.cam_from_map)
+            .collect()
     }
 
     fn splats(&mut self) -> Splats {
         self.splats.clone()
     }
 
-    fn render(&mut self, intrinsics: &Intrinsics, cam_from_map: &Rigid, sh_degree: u8) -> Rendering {
-        self.pass.render(&self.splats, &Camera::new(intrinsics, cam_from_map), sh_degree);
+    fn render(
+        &mut self,
+        intrinsics: &Intrinsics,
+        cam_from_map: &Rigid,
+        sh_degree: u8,
+    ) -> Rendering {
+        self.pass.render(
+            &self.splats,
+            &Camera::new(intrinsics, cam_from_map),
+            sh_degree,
+        );
         self.pass.raster.rendering()
     }
 }
@@ -254,61 +296,44 @@ impl Engine for CpuEngine {
 impl Pass {
     fn render(&mut self, splats: &Splats, camera: &Camera, sh_degree: u8) {
         project::project(splats, camera, sh_degree, &mut self.projected);
-        bin::bin(&self.projected.splats, camera.width_px, camera.height_px, &mut self.tiles);
+        bin::bin(
+            &self.projected.splats,
+            camera.width_px,
+            camera.height_px,
+            &mut self.tiles,
+        );
         raster::raster(&self.projected.splats, &self.tiles, &mut self.raster);
     }
 
-    fn differentiate(&mut self, splats: &Splats, view: &TrainingView, settings: &StepSettings) -> LossValue {
+    fn differentiate(
+        &mut self,
+        splats: &Splats,
+        view: &TrainingView,
+        settings: &StepSettings,
+    ) -> LossValue {
         let camera = Camera::new(&view.intrinsics, &view.cam_from_map);
         self.render(splats, &camera, settings.sh_degree);
         let visible = &self.projected.splats;
-        let target = Target { image: &view.image, depth: view.depth.as_deref() };
+        let target = Target {
+            image: &view.image,
+            depth: view.depth.as_deref(),
+        };
         let value = loss::loss(&self.raster, &target, settings, &mut self.pixels);
-        raster_backward::raster_backward(visible, &self.tiles, &self.raster, &self.pixels, &mut self.instances);
-        let forward = Forward { splats, camera: &camera, visible, tiles: &self.tiles };
+        raster_backward::raster_backward(
+            visible,
+            &self.tiles,
+            &self.raster,
+            &self.pixels,
+            &mut self.instances,
+        );
+        let forward = Forward {
+            splats,
+            camera: &camera,
+            visible,
+            tiles: &self.tiles,
+        };
         project_backward::project_backward(forward, &self.instances, settings, &mut self.gradients);
         value
-    }
-}
-
-impl Optimiser {
-    fn resize(&mut self, splats: &Splats) {
-        let n = splats.len();
-        self.ages.resize(n, 0);
-        for (moments, stride) in self.moments_mut(splats.sh_stride()) {
-            moments.resize(n * stride);
-        }
-    }
-
-    /// With the numbers of one splat: `retain_rows` and `resize` need them, since moments are flat.
-    fn moments_mut(&mut self, sh_stride: usize) -> [(&mut Moments, usize); 5] {
-        [
-            (&mut self.means, 3),
-            (&mut self.log_scales, 3),
-            (&mut self.quats, 4),
-            (&mut self.opacity_logits, 1),
-            (&mut self.sh, sh_stride),
-        ]
-    }
-
-    /// Returns the number of splats left alone because their gradient is not finite.
-    fn update(&mut self, splats: &mut Splats, pass: &Pass, settings: &StepSettings) -> usize {
-        let (projected, g) = (&pass.projected, &pass.gradients);
-        let n_skipped = adam::age(projected, &g.is_finite, &mut self.ages, &mut self.corrections);
-        let sh_stride = splats.sh_stride();
-        let one = |rate| [rate, rate];
-        let corrections = &self.corrections;
-        let run = |params, moments, [stride, grad_stride]: [usize; 2], grads, rates| {
-            adam::adam(Attribute { params, moments, stride, grads, grad_stride, rates }, projected, corrections);
-        };
-        run(splats.means.as_flattened_mut(), &mut self.means, [3, 3], g.means.as_flattened(), one(settings.lr_mean));
-        let scales = g.log_scales.as_flattened();
-        run(splats.log_scales.as_flattened_mut(), &mut self.log_scales, [3, 3], scales, one(settings.lr_scale));
-        run(splats.quats.as_flattened_mut(), &mut self.quats, [4, 4], g.quats.as_flattened(), one(settings.lr_quat));
-        run(&mut splats.opacity_logits, &mut self.opacity_logits, [1, 1], &g.opacity_logits, one(settings.lr_opacity));
-        let sh_rates = [settings.lr_sh0, settings.lr_sh_rest];
-        run(&mut splats.sh, &mut self.sh, [sh_stride, g.sh_stride], &g.sh, sh_rates);
-        n_skipped
     }
 }
 
@@ -316,33 +341,36 @@ impl Splats {
     /// Our own mistake when it fails: readers of files check before.
     fn assert_consistent(&self) {
         let n = self.means.len();
-        let lengths = [self.log_scales.len(), self.quats.len(), self.opacity_logits.len(), self.anchors.len()];
+        let lengths = [
+            self.log_scales.len(),
+            self.quats.len(),
+            self.opacity_logits.len(),
+            self.anchors.len(),
+        ];
         assert_eq!(lengths, [n; 4], "all attributes of splats have one length");
-        assert!(self.sh_degree <= 3, "SH degree {} is above 3", self.sh_degree);
-        assert_eq!(self.sh.len(), n * self.sh_stride(), "SH has `sh_stride` numbers a splat");
+        assert!(
+            self.sh_degree <= 3,
+            "SH degree {} is above 3",
+            self.sh_degree
+        );
+        assert_eq!(
+            self.sh.len(),
+            n * self.sh_stride(),
+            "SH has `sh_stride` numbers a splat"
+        );
     }
-}
-
-/// Keeps row i of `stride` values when `keep[i]`.
-fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[bool]) {
-    let mut end = 0;
-    for (i, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
-        values.copy_within(i * stride..(i + 1) * stride, end);
-        end += stride;
-    }
-    values.truncate(end);
 }
 
 fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
-        if std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512vl") {
-            return "avx512";
+        use std::arch::is_x86_feature_detected as has;
+        if !has!("avx2") || !has!("fma") {
+            return "sse2";
         }
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            return "avx2+fma";
-        }
-        "sse2"
+        let has_avx512 =
+            has!("avx512f") && has!("avx512vl") && has!("avx512bw") && has!("avx512dq");
+        if has_avx512 { "avx512" } else { "avx2+fma" }
     }
     #[cfg(target_arch = "aarch64")]
     {

@@ -26,7 +26,10 @@ impl PoseAdam {
             return None;
         }
         self.age = self.age.saturating_add(1);
-        let unbias = [1.0 - BETA_1.powf(f64::from(self.age)), 1.0 - BETA_2.powf(f64::from(self.age))];
+        let unbias = [
+            1.0 - BETA_1.powf(f64::from(self.age)),
+            1.0 - BETA_2.powf(f64::from(self.age)),
+        ];
         let delta: [f64; 6] = std::array::from_fn(|i| {
             let g = gradient[i];
             self.first[i] = BETA_1 * self.first[i] + (1.0 - BETA_1) * g;
@@ -35,7 +38,10 @@ impl PoseAdam {
             -f64::from(rates[i / 3]) * direction
         });
         let [rho_x, rho_y, rho_z, theta_x, theta_y, theta_z] = delta;
-        let step = Rigid::exp(DVec3::new(rho_x, rho_y, rho_z), DVec3::new(theta_x, theta_y, theta_z));
+        let step = Rigid::exp(
+            DVec3::new(rho_x, rho_y, rho_z),
+            DVec3::new(theta_x, theta_y, theta_z),
+        );
         Some((step * *pose).renormalized())
     }
 }

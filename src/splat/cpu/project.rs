@@ -25,8 +25,8 @@ pub(crate) const CHUNK: usize = 256;
 const MAX_EXTENT_SIGMAS: f64 = 3.33;
 /// Squares of pixel coordinates beyond this lose their meaning in f32.
 const MAX_CENTER_PX: f64 = 1e9;
-/// Keeps the exact extents on the safe side of f32 rounding in `raster`.
-const EXTENT_SLACK_PX: f64 = 0.01;
+/// A colour beyond this is a broken splat; its square would take SSIM, and with it the whole picture, to infinity.
+const MAX_COLOR: f32 = 1e4;
 
 /// A pinhole at a pose.
 #[derive(Debug, Clone)]
@@ -45,8 +45,9 @@ pub struct Camera {
     slope_max: DVec2,
 }
 
-/// One visible splat on the picture.
+/// One visible splat on the picture; a cache line, since tiles fetch them in no order.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(align(64))]
 pub struct ProjectedSplat {
     pub splat_ix: u32,
     /// z in the camera.
@@ -57,8 +58,6 @@ pub struct ProjectedSplat {
     pub opacity: f32,
     /// Exactly 0 where spherical harmonics went below black.
     pub color: [f32; 3],
-    /// Half of the box outside which alpha < `MIN_ALPHA`.
-    pub half_px: [f32; 2],
     /// `ln(opacity / MIN_ALPHA)`: exponents above it are invisible.
     pub cut: f32,
     /// Half-open rectangle of tiles: x0, y0, x1, y1.
@@ -99,11 +98,14 @@ pub(crate) struct Shape {
 pub fn project(splats: &Splats, camera: &Camera, sh_degree: u8, out: &mut Projected) {
     let n_chunks = splats.len().div_ceil(CHUNK);
     out.chunks.resize_with(n_chunks, Vec::new);
-    out.chunks.par_iter_mut().enumerate().for_each(|(c, chunk)| {
-        chunk.clear();
-        let range = c * CHUNK..splats.len().min((c + 1) * CHUNK);
-        chunk.extend(range.filter_map(|ix| project_one(splats, ix, camera, sh_degree)));
-    });
+    out.chunks
+        .par_iter_mut()
+        .enumerate()
+        .for_each(|(c, chunk)| {
+            chunk.clear();
+            let range = c * CHUNK..splats.len().min((c + 1) * CHUNK);
+            chunk.extend(range.filter_map(|ix| project_one(splats, ix, camera, sh_degree)));
+        });
     out.splats.clear();
     out.chunk_ends.clear();
     for chunk in &out.chunks {
@@ -112,28 +114,45 @@ pub fn project(splats: &Splats, camera: &Camera, sh_degree: u8, out: &mut Projec
     }
 }
 
-fn project_one(splats: &Splats, ix: usize, camera: &Camera, sh_degree: u8) -> Option<ProjectedSplat> {
+fn project_one(
+    splats: &Splats,
+    ix: usize,
+    camera: &Camera,
+    sh_degree: u8,
+) -> Option<ProjectedSplat> {
     let opacity = sigmoid(splats.opacity_logits[ix]);
-    // Written so that NaN is culled too.
-    if !(opacity >= MIN_ALPHA) {
+    if opacity < MIN_ALPHA || opacity.is_nan() {
         return None;
     }
-    let shape = Shape::new(splats.means[ix], splats.log_scales[ix], splats.quats[ix], camera)?;
+    let shape = Shape::new(
+        splats.means[ix],
+        splats.log_scales[ix],
+        splats.quats[ix],
+        camera,
+    )?;
     let center = camera.pixel(shape.mean_in_cam);
     let cut = f64::from(opacity / MIN_ALPHA).ln().max(0.0);
     let sigmas = (2.0 * cut).sqrt().min(MAX_EXTENT_SIGMAS);
     let half = DVec2::new(shape.cov[0].sqrt(), shape.cov[2].sqrt()) * sigmas;
     let tiles = tile_rectangle(center, half.ceil(), camera)?;
-    let color = color(splats, ix, shape_direction(splats.means[ix], camera), sh_degree)?;
+    let color = color(
+        splats,
+        ix,
+        shape_direction(splats.means[ix], camera),
+        sh_degree,
+    )?;
     let [s00, s01, s11] = shape.cov;
     Some(ProjectedSplat {
         splat_ix: ix as u32,
         depth: shape.mean_in_cam.z as f32,
         center: center.as_vec2().to_array(),
-        conic: [(s11 / shape.det) as f32, (-s01 / shape.det) as f32, (s00 / shape.det) as f32],
+        conic: [
+            (s11 / shape.det) as f32,
+            (-s01 / shape.det) as f32,
+            (s00 / shape.det) as f32,
+        ],
         opacity,
         color,
-        half_px: (half + EXTENT_SLACK_PX).as_vec2().to_array(),
         cut: cut as f32,
         tiles,
     })
@@ -143,7 +162,9 @@ fn project_one(splats: &Splats, ix: usize, camera: &Camera, sh_degree: u8) -> Op
 fn tile_rectangle(center: DVec2, radius: DVec2, camera: &Camera) -> Option<[u16; 4]> {
     let size = DVec2::new(f64::from(camera.width_px), f64::from(camera.height_px));
     let (low, high) = (center - radius, center + radius);
-    let touches = high.cmpgt(DVec2::ZERO).all() && low.cmplt(size).all() && center.abs().max_element() < MAX_CENTER_PX;
+    let touches = high.cmpgt(DVec2::ZERO).all()
+        && low.cmplt(size).all()
+        && center.abs().max_element() < MAX_CENTER_PX;
     if !touches {
         return None;
     }
@@ -159,25 +180,38 @@ pub(crate) fn shape_direction(mean: [f32; 3], camera: &Camera) -> DVec3 {
     (vec3(mean) - camera.center_in_map).normalize_or_zero()
 }
 
-/// `None` when a coefficient is not finite.
+/// `None` when it is NaN or absurd.
 fn color(splats: &Splats, ix: usize, dir: DVec3, sh_degree: u8) -> Option<[f32; 3]> {
     let degree = sh_degree.min(splats.sh_degree);
     let basis = sh::basis(dir, degree);
     let stride = splats.sh_stride();
     let mut color = [0.5; 3];
     let (coefficients, _) = splats.sh[ix * stride..(ix + 1) * stride].as_chunks::<3>();
-    for (b, k) in basis.iter().zip(&coefficients[..sh::n_coefficients(degree)]) {
+    for (b, k) in basis
+        .iter()
+        .zip(&coefficients[..sh::n_coefficients(degree)])
+    {
         for (sum, k) in color.iter_mut().zip(k) {
             *sum += b * f64::from(*k);
         }
     }
     let color = color.map(|c| c as f32);
-    color.iter().all(|c| c.is_finite()).then(|| color.map(|c| c.max(0.0)))
+    color
+        .iter()
+        .all(|c| c.abs() < MAX_COLOR)
+        .then(|| color.map(|c| c.max(0.0)))
 }
 
 impl Camera {
     pub fn new(intrinsics: &Intrinsics, cam_from_map: &Rigid) -> Self {
-        let Intrinsics { width_px, height_px, fx, fy, cx, cy } = *intrinsics;
+        let Intrinsics {
+            width_px,
+            height_px,
+            fx,
+            fy,
+            cx,
+            cy,
+        } = *intrinsics;
         let center_in_map = cam_from_map.inverse().translation;
         let size = DVec2::new(f64::from(width_px), f64::from(height_px));
         let focal = DVec2::new(fx, fy);
@@ -201,13 +235,21 @@ impl Camera {
 
     fn pixel(&self, point_in_cam: DVec3) -> DVec2 {
         let inv_z = 1.0 / point_in_cam.z;
-        DVec2::new(self.fx * point_in_cam.x * inv_z + self.cx, self.fy * point_in_cam.y * inv_z + self.cy)
+        DVec2::new(
+            self.fx * point_in_cam.x * inv_z + self.cx,
+            self.fy * point_in_cam.y * inv_z + self.cy,
+        )
     }
 }
 
 impl Shape {
     /// `None`: too near, or a number that is not finite.
-    pub(crate) fn new(mean: [f32; 3], log_scale: [f32; 3], quat: [f32; 4], camera: &Camera) -> Option<Self> {
+    pub(crate) fn new(
+        mean: [f32; 3],
+        log_scale: [f32; 3],
+        quat: [f32; 4],
+        camera: &Camera,
+    ) -> Option<Self> {
         let p = camera.rotation * vec3(mean) + camera.translation;
         if !(p.z > NEAR && p.is_finite()) {
             return None;

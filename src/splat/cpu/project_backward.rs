@@ -60,7 +60,12 @@ struct Gradient {
 }
 
 /// Sums the instances of each visible splat and takes them through the projection.
-pub fn project_backward(forward: Forward<'_>, instances: &InstanceGradients, settings: &StepSettings, out: &mut SplatGradients) {
+pub fn project_backward(
+    forward: Forward<'_>,
+    instances: &InstanceGradients,
+    settings: &StepSettings,
+    out: &mut SplatGradients,
+) {
     let degree = settings.sh_degree.min(forward.splats.sh_degree);
     out.resize(forward.visible.len(), degree);
     let stride = out.sh_stride;
@@ -74,24 +79,30 @@ pub fn project_backward(forward: Forward<'_>, instances: &InstanceGradients, set
         out.is_finite.par_chunks_mut(CHUNK),
         out.partials.par_iter_mut(),
     );
-    chunks.into_par_iter().enumerate().for_each(|(c, (visible, means, log_scales, quats, logits, sh, is_finite, partial))| {
-        *partial = Partial::default();
-        for (k, projected) in visible.iter().enumerate() {
-            let sh = &mut sh[k * stride..(k + 1) * stride];
-            let sums = forward.sum_instances(c * CHUNK + k, instances);
-            let gradient = forward.splat_gradient(projected, &sums, settings, sh, partial);
-            means[k] = gradient.mean.as_vec3().to_array();
-            log_scales[k] = gradient.log_scale.as_vec3().to_array();
-            quats[k] = gradient.quat.map(|g| g as f32);
-            logits[k] = gradient.opacity_logit as f32;
-            let all = means[k].iter().chain(&log_scales[k]).chain(&quats[k]).chain(&logits[k..=k]).chain(&*sh);
-            is_finite[k] = all.map(|g| g.abs()).sum::<f32>().is_finite();
-            if is_finite[k] {
-                partial.rho += gradient.rho;
-                partial.theta += gradient.theta;
+    chunks.into_par_iter().enumerate().for_each(
+        |(c, (visible, means, log_scales, quats, logits, sh, is_finite, partial))| {
+            *partial = Partial::default();
+            let mut sums = [InstanceGradient::default(); CHUNK];
+            // All at once: the slots are scattered over memory, and in one short loop their loads overlap.
+            for (k, sum) in sums[..visible.len()].iter_mut().enumerate() {
+                *sum = forward.sum_instances(c * CHUNK + k, instances);
             }
-        }
-    });
+            for (k, (projected, sum)) in visible.iter().zip(&sums).enumerate() {
+                let sh = &mut sh[k * stride..(k + 1) * stride];
+                let gradient = forward.splat_gradient(projected, sum, settings, sh, partial);
+                means[k] = gradient.mean.as_vec3().to_array();
+                log_scales[k] = gradient.log_scale.as_vec3().to_array();
+                quats[k] = gradient.quat.map(|g| g as f32);
+                logits[k] = gradient.opacity_logit as f32;
+                let geometry = [&means[k][..], &log_scales[k], &quats[k], &logits[k..=k]];
+                is_finite[k] = geometry.iter().all(|part| all_finite(part)) && all_finite(sh);
+                if is_finite[k] {
+                    partial.rho += gradient.rho;
+                    partial.theta += gradient.theta;
+                }
+            }
+        },
+    );
     out.sum_partials(settings);
 }
 
@@ -121,7 +132,12 @@ impl Forward<'_> {
     ) -> Gradient {
         let ix = projected.splat_ix as usize;
         let mean = self.splats.means[ix];
-        let Some(shape) = Shape::new(mean, self.splats.log_scales[ix], self.splats.quats[ix], self.camera) else {
+        let Some(shape) = Shape::new(
+            mean,
+            self.splats.log_scales[ix],
+            self.splats.quats[ix],
+            self.camera,
+        ) else {
             return Gradient::NONE;
         };
         let g_direction = self.sh_gradient(projected, sums, sh);
@@ -134,12 +150,14 @@ impl Forward<'_> {
         let g_j0 = 2.0 * (cov_in_cam * (j0 * g00 + j1 * g01));
         let g_j1 = 2.0 * (cov_in_cam * (j0 * g01 + j1 * g11));
         let g_center = DVec2::new(f64::from(sums.center[0]), f64::from(sums.center[1]));
-        let g_in_cam = position_gradient(&shape, self.camera, g_center, [g_j0, g_j1]) + DVec3::Z * f64::from(sums.depth);
+        let g_in_cam = position_gradient(&shape, self.camera, g_center, [g_j0, g_j1])
+            + DVec3::Z * f64::from(sums.depth);
 
         let back = self.camera.rotation.transpose();
         let g_cov = back * g_cov_in_cam * self.camera.rotation;
         let g_root = 2.0 * (g_cov * shape.rotation * DMat3::from_diagonal(shape.scale));
-        let g_scale = DVec3::from_array([0, 1, 2].map(|k| shape.rotation.col(k).dot(g_root.col(k))));
+        let g_scale =
+            DVec3::from_array([0, 1, 2].map(|k| shape.rotation.col(k).dot(g_root.col(k))));
         let g_rotation = g_root * DMat3::from_diagonal(shape.scale);
 
         let opacity = f64::from(sigmoid(self.splats.opacity_logits[ix]));
@@ -162,15 +180,25 @@ impl Forward<'_> {
     }
 
     /// Returns the gradient of the mean through the viewing direction.
-    fn sh_gradient(&self, projected: &ProjectedSplat, sums: &InstanceGradient, sh: &mut [f32]) -> DVec3 {
+    fn sh_gradient(
+        &self,
+        projected: &ProjectedSplat,
+        sums: &InstanceGradient,
+        sh: &mut [f32],
+    ) -> DVec3 {
         let ix = projected.splat_ix as usize;
         let n_coefficients = sh.len() / 3;
         let degree = (n_coefficients.isqrt() - 1) as u8;
         let dir = shape_direction(self.splats.means[ix], self.camera);
         let basis = sh::basis(dir, degree);
         // Where SH was clamped at black, nothing flows.
-        let g_color: [f64; 3] =
-            std::array::from_fn(|c| if projected.color[c] > 0.0 { f64::from(sums.color[c]) } else { 0.0 });
+        let g_color: [f64; 3] = std::array::from_fn(|c| {
+            if projected.color[c] > 0.0 {
+                f64::from(sums.color[c])
+            } else {
+                0.0
+            }
+        });
         let stride = self.splats.sh_stride();
         let (coefficients, _) = self.splats.sh[ix * stride..(ix + 1) * stride].as_chunks::<3>();
         let (out, _) = sh.as_chunks_mut::<3>();
@@ -180,9 +208,15 @@ impl Forward<'_> {
             weights[b] = k.iter().zip(&g_color).map(|(&k, g)| f64::from(k) * g).sum();
         }
         let g_dir = sh::basis_gradient(dir, degree, &weights);
-        let distance = (super::project::vec3(self.splats.means[ix]) - self.camera.center_in_map).length();
+        let distance =
+            (super::project::vec3(self.splats.means[ix]) - self.camera.center_in_map).length();
         (g_dir - dir * g_dir.dot(dir)) / distance
     }
+}
+
+/// Without a branch per number, so that it vectorises.
+fn all_finite(numbers: &[f32]) -> bool {
+    numbers.iter().fold(true, |all, x| all & x.is_finite())
 }
 
 /// Conic to 2D covariance: -Q GQ Q, upper triangle.
@@ -193,17 +227,30 @@ fn cov2d_gradient(shape: &Shape, g_conic: [f64; 3]) -> [f64; 3] {
     // Rows of GQ Q.
     let (r00, r01) = (ga * a + gb * b, ga * b + gb * c);
     let (r10, r11) = (gb * a + gc * b, gb * b + gc * c);
-    [-(a * r00 + b * r10), -(a * r01 + b * r11), -(b * r01 + c * r11)]
+    [
+        -(a * r00 + b * r10),
+        -(a * r01 + b * r11),
+        -(b * r01 + c * r11),
+    ]
 }
 
 /// Through the pixel and through the Jacobian, not through the depth channel.
-fn position_gradient(shape: &Shape, camera: &Camera, g_center: DVec2, [g_j0, g_j1]: [DVec3; 2]) -> DVec3 {
+fn position_gradient(
+    shape: &Shape,
+    camera: &Camera,
+    g_center: DVec2,
+    [g_j0, g_j1]: [DVec3; 2],
+) -> DVec3 {
     let p = shape.mean_in_cam;
     let (focal, inv_z) = (DVec2::new(camera.fx, camera.fy), 1.0 / p.z);
     let g_diagonal = DVec2::new(g_j0.x, g_j1.y);
     let g_slope = DVec2::new(g_j0.z, g_j1.z);
     // A clamped slope depends on z alone, a free one on x and twice on z.
-    let free = DVec2::from_array(shape.is_clamped.map(|is_clamped| if is_clamped { 0.0 } else { 1.0 }));
+    let free = DVec2::from_array(
+        shape
+            .is_clamped
+            .map(|is_clamped| if is_clamped { 0.0 } else { 1.0 }),
+    );
     let g_xy = focal * inv_z * g_center - free * focal * inv_z * inv_z * g_slope;
     let g_z = -focal * p.truncate() * inv_z * inv_z * g_center - focal * inv_z * inv_z * g_diagonal
         + (1.0 + free) * focal * shape.slope * inv_z * inv_z * g_slope;
@@ -216,9 +263,15 @@ fn quat_gradient(shape: &Shape, g_rotation: &DMat3) -> [f64; 4] {
     let g = |row: usize, column: usize| g_rotation.col(column - 1)[row - 1];
     let unit = [
         2.0 * (x * (g(3, 2) - g(2, 3)) + y * (g(1, 3) - g(3, 1)) + z * (g(2, 1) - g(1, 2))),
-        2.0 * (-2.0 * x * (g(2, 2) + g(3, 3)) + y * (g(2, 1) + g(1, 2)) + z * (g(3, 1) + g(1, 3)) + w * (g(3, 2) - g(2, 3))),
-        2.0 * (x * (g(2, 1) + g(1, 2)) - 2.0 * y * (g(1, 1) + g(3, 3)) + z * (g(3, 2) + g(2, 3)) + w * (g(1, 3) - g(3, 1))),
-        2.0 * (x * (g(3, 1) + g(1, 3)) + y * (g(3, 2) + g(2, 3)) - 2.0 * z * (g(1, 1) + g(2, 2)) + w * (g(2, 1) - g(1, 2))),
+        2.0 * (-2.0 * x * (g(2, 2) + g(3, 3))
+            + y * (g(2, 1) + g(1, 2))
+            + z * (g(3, 1) + g(1, 3))
+            + w * (g(3, 2) - g(2, 3))),
+        2.0 * (x * (g(2, 1) + g(1, 2)) - 2.0 * y * (g(1, 1) + g(3, 3))
+            + z * (g(3, 2) + g(2, 3))
+            + w * (g(1, 3) - g(3, 1))),
+        2.0 * (x * (g(3, 1) + g(1, 3)) + y * (g(3, 2) + g(2, 3)) - 2.0 * z * (g(1, 1) + g(2, 2))
+            + w * (g(2, 1) - g(1, 2))),
     ];
     let along: f64 = unit.iter().zip(&shape.quat).map(|(g, q)| g * q).sum();
     std::array::from_fn(|i| (unit[i] - along * shape.quat[i]) / shape.quat_length)
@@ -241,6 +294,7 @@ impl Gradient {
 }
 
 impl InstanceGradient {
+    #[inline(always)]
     fn add(&mut self, other: &Self) {
         for (sum, x) in self.center.iter_mut().zip(other.center) {
             *sum += x;
@@ -277,9 +331,16 @@ impl SplatGradients {
             sum.opacity += partial.opacity;
             sum.scale += partial.scale;
         }
-        self.pose = [sum.rho.x, sum.rho.y, sum.rho.z, sum.theta.x, sum.theta.y, sum.theta.z];
+        self.pose = [
+            sum.rho.x,
+            sum.rho.y,
+            sum.rho.z,
+            sum.theta.x,
+            sum.theta.y,
+            sum.theta.z,
+        ];
         let n = self.means.len().max(1) as f64;
-        self.regulariser =
-            f64::from(settings.opacity_reg) * sum.opacity / n + f64::from(settings.scale_reg) * sum.scale / (3.0 * n);
+        self.regulariser = f64::from(settings.opacity_reg) * sum.opacity / n
+            + f64::from(settings.scale_reg) * sum.scale / (3.0 * n);
     }
 }

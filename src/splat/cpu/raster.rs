@@ -5,7 +5,7 @@
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::bin::Tiles;
+use super::bin::{CUT_SLACK, Tiles};
 use super::lanes::{LANES, Lane, exp2, madd};
 use super::project::{MIN_ALPHA, ProjectedSplat, TILE_PX};
 use crate::splat::Rendering;
@@ -16,8 +16,8 @@ pub(crate) const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Vectors in a row of a tile, and in a tile.
 pub(crate) const ROW_VECTORS: usize = TILE_PX / LANES;
 pub(crate) const TILE_VECTORS: usize = TILE_PX * ROW_VECTORS;
-/// Splats between two looks at whether all pixels of the tile have stopped.
-const STOP_CHECK_EVERY: usize = 16;
+/// Splats of a tile that are fetched together; between batches, a look at whether all pixels have stopped.
+pub(crate) const BATCH: usize = 16;
 /// Zeros left and right of each row of a plane: SSIM's window reaches 5 pixels out.
 pub const PLANE_MARGIN: usize = 8;
 
@@ -56,7 +56,7 @@ pub(crate) struct TileArea {
 }
 
 /// A splat as the loops of one tile want it.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct TileSplat {
     pub(crate) opacity: f32,
     /// From the centre of the tile's first pixel to the splat's centre.
@@ -66,8 +66,10 @@ pub(crate) struct TileSplat {
     pub(crate) half_a: f32,
     pub(crate) b: f32,
     pub(crate) half_c: f32,
-    pub(crate) rows: std::ops::Range<usize>,
-    pub(crate) vectors: std::ops::Range<usize>,
+    pub(crate) color: [f32; 3],
+    pub(crate) depth: f32,
+    /// Bit v: the splat reaches a pixel of vector v.
+    reach: u32,
 }
 
 /// Composites all tiles.
@@ -75,14 +77,26 @@ pub fn raster(visible: &[ProjectedSplat], tiles: &Tiles, out: &mut Raster) {
     out.width_px = tiles.width_px as usize;
     out.height_px = tiles.height_px as usize;
     out.tiles.resize(tiles.n_tiles(), TilePixels::EMPTY);
-    out.tiles.par_iter_mut().enumerate().for_each(|(tile, pixels)| {
-        raster_tile(visible, tiles.of(tile), tiles.area(tile), pixels);
-    });
+    out.tiles
+        .par_iter_mut()
+        .enumerate()
+        .for_each(|(tile, pixels)| {
+            raster_tile(visible, tiles.of(tile), tiles.area(tile), pixels);
+        });
     unroll(tiles.n_x, out);
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn raster_tile(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, out: &mut TilePixels) {
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
+fn raster_tile(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    out: &mut TilePixels,
+) {
     multiversion::target::match_target! {
         "x86_64+avx2+fma" => composite::<true>(visible, instances, area, out),
         "aarch64+neon" => composite::<true>(visible, instances, area, out),
@@ -91,39 +105,23 @@ fn raster_tile(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, ou
 }
 
 #[inline(always)]
-fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], area: TileArea, out: &mut TilePixels) {
+fn composite<const FMA: bool>(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    out: &mut TilePixels,
+) {
     out.clear(area);
-    out.n_used = instances.len() as u32;
-    for (k, &ix) in instances.iter().enumerate() {
-        if k % STOP_CHECK_EVERY == 0 && all_stopped(&out.transmittance) {
-            out.n_used = k as u32;
+    out.n_used = 0;
+    let mut batch = [TileSplat::NONE; BATCH];
+    for instances in instances.chunks(BATCH) {
+        if all_stopped(&out.transmittance) {
             break;
         }
-        let splat = &visible[ix as usize];
-        let local = TileSplat::new(splat, area);
-        let dx = local.dx();
-        for row in local.rows.clone() {
-            let dy = local.y - row as f32;
-            for half in local.vectors.clone() {
-                let v = row * ROW_VECTORS + half;
-                let mut w = [0.0; LANES];
-                let mut t = out.transmittance[v];
-                for i in 0..LANES {
-                    let alpha = local.alpha::<FMA>(dx[half][i], dy).0;
-                    let next = t[i] * (1.0 - alpha);
-                    let is_seen = alpha >= MIN_ALPHA;
-                    let is_over = next <= MIN_TRANSMITTANCE;
-                    w[i] = if is_seen && !is_over { alpha * t[i] } else { 0.0 };
-                    let stopped = if is_over { -t[i].abs() } else { next };
-                    t[i] = if is_seen { stopped } else { t[i] };
-                }
-                out.transmittance[v] = t;
-                for i in 0..LANES {
-                    out.rgb[0][v][i] = madd::<FMA>(w[i], splat.color[0], out.rgb[0][v][i]);
-                    out.rgb[1][v][i] = madd::<FMA>(w[i], splat.color[1], out.rgb[1][v][i]);
-                    out.rgb[2][v][i] = madd::<FMA>(w[i], splat.color[2], out.rgb[2][v][i]);
-                    out.depth_sum[v][i] = madd::<FMA>(w[i], splat.depth, out.depth_sum[v][i]);
-                }
+        out.n_used += instances.len() as u32;
+        for splat in load_batch(visible, instances, area, &mut batch) {
+            for v in splat.vectors() {
+                blend::<FMA>(splat, v, out);
             }
         }
     }
@@ -132,11 +130,56 @@ fn composite<const FMA: bool>(visible: &[ProjectedSplat], instances: &[u32], are
     }
 }
 
+/// One vector of pixels. Everything goes through locals: LLVM makes masked stores of selects into memory, which
+/// stall the loads behind them.
+#[inline(always)]
+fn blend<const FMA: bool>(splat: &TileSplat, v: usize, out: &mut TilePixels) {
+    let (x, dy) = splat.offset_to(v);
+    let [red, green, blue] = splat.color;
+    let mut t = out.transmittance[v];
+    let [mut r, mut g, mut b] = out.rgb.each_ref().map(|channel| channel[v]);
+    let mut z = out.depth_sum[v];
+    for i in 0..LANES {
+        let (alpha, _) = splat.alpha::<FMA>(x - i as f32, dy);
+        let next = t[i] * (1.0 - alpha);
+        let is_over = next <= MIN_TRANSMITTANCE;
+        let weight = if is_over { 0.0 } else { alpha * t[i] };
+        r[i] = madd::<FMA>(weight, red, r[i]);
+        g[i] = madd::<FMA>(weight, green, g[i]);
+        b[i] = madd::<FMA>(weight, blue, b[i]);
+        z[i] = madd::<FMA>(weight, splat.depth, z[i]);
+        t[i] = if is_over { -t[i].abs() } else { next };
+    }
+    out.transmittance[v] = t;
+    for (channel, value) in out.rgb.iter_mut().zip([r, g, b]) {
+        channel[v] = value;
+    }
+    out.depth_sum[v] = z;
+}
+
+/// Brings the next splats of a tile from all over memory into one place; the loads overlap.
+#[inline(always)]
+pub(crate) fn load_batch<'a>(
+    visible: &[ProjectedSplat],
+    instances: &[u32],
+    area: TileArea,
+    batch: &'a mut [TileSplat; BATCH],
+) -> &'a [TileSplat] {
+    for (slot, &ix) in batch.iter_mut().zip(instances) {
+        *slot = TileSplat::new(&visible[ix as usize], area);
+    }
+    &batch[..instances.len()]
+}
+
 /// Pixels off the picture count as stopped from the start.
 #[inline(always)]
 pub(crate) fn start_transmittance(area: TileArea) -> [Lane; TILE_VECTORS] {
     let mut t = [[-1.0; LANES]; TILE_VECTORS];
-    for row in t.as_flattened_mut().chunks_exact_mut(TILE_PX).take(area.n_rows) {
+    for row in t
+        .as_flattened_mut()
+        .chunks_exact_mut(TILE_PX)
+        .take(area.n_rows)
+    {
         row[..area.n_columns].fill(1.0);
     }
     t
@@ -166,18 +209,22 @@ fn unroll(n_x: usize, out: &mut Raster) {
             plane.clear();
         }
         plane.resize(stride * out.height_px, 0.0);
-        plane.par_chunks_mut(stride).with_min_len(TILE_PX).enumerate().for_each(|(y, row)| {
-            let tile_row = &tiles[y / TILE_PX * n_x..][..n_x];
-            let row = &mut row[PLANE_MARGIN..][..width];
-            for (pixels, out) in tile_row.iter().zip(row.chunks_mut(TILE_PX)) {
-                let first = y % TILE_PX * TILE_PX;
-                let from = &pixels.plane(p)[first..][..out.len()];
-                out.copy_from_slice(from);
-                if p == 3 {
-                    out.iter_mut().for_each(|t| *t = 1.0 - *t);
+        plane
+            .par_chunks_mut(stride)
+            .with_min_len(TILE_PX)
+            .enumerate()
+            .for_each(|(y, row)| {
+                let tile_row = &tiles[y / TILE_PX * n_x..][..n_x];
+                let row = &mut row[PLANE_MARGIN..][..width];
+                for (pixels, out) in tile_row.iter().zip(row.chunks_mut(TILE_PX)) {
+                    let first = y % TILE_PX * TILE_PX;
+                    let from = &pixels.plane(p)[first..][..out.len()];
+                    out.copy_from_slice(from);
+                    if p == 3 {
+                        out.iter_mut().for_each(|t| *t = 1.0 - *t);
+                    }
                 }
-            }
-        });
+            });
     }
 }
 
@@ -206,52 +253,84 @@ impl TilePixels {
 }
 
 impl TileSplat {
+    pub(crate) const NONE: Self = Self {
+        opacity: 0.0,
+        x: 0.0,
+        y: 0.0,
+        half_a: 0.0,
+        b: 0.0,
+        half_c: 0.0,
+        color: [0.0; 3],
+        depth: 0.0,
+        reach: 0,
+    };
+
     #[inline(always)]
-    pub(crate) fn new(splat: &ProjectedSplat, area: TileArea) -> Self {
+    fn new(splat: &ProjectedSplat, area: TileArea) -> Self {
         const LOG2_E: f32 = std::f32::consts::LOG2_E;
-        let x = splat.center[0] - (area.x as f32 + 0.5);
-        let y = splat.center[1] - (area.y as f32 + 0.5);
         let [a, b, c] = splat.conic;
-        let [half_x, half_y] = splat.half_px;
-        // Pixel k of a row is reached when |k - x| <= half_x; `as` cuts off and takes negative to 0.
-        let first_row = ((y - half_y + 0.99) as usize).min(area.n_rows);
-        let end_row = ((y + half_y + 1.0) as usize).clamp(first_row, area.n_rows);
-        let first_column = (x - half_x + 0.99) as usize;
-        let end_column = ((x + half_x + 1.0) as usize).min(area.n_columns);
-        let first_vector = (first_column / LANES).min(ROW_VECTORS);
-        Self {
+        let mut local = Self {
             opacity: splat.opacity,
-            x,
-            y,
+            x: splat.center[0] - (area.x as f32 + 0.5),
+            y: splat.center[1] - (area.y as f32 + 0.5),
             half_a: -0.5 * LOG2_E * a,
             b: -LOG2_E * b,
             half_c: -0.5 * LOG2_E * c,
-            rows: first_row..end_row,
-            vectors: first_vector..end_column.div_ceil(LANES).max(first_vector),
-        }
+            color: splat.color,
+            depth: splat.depth,
+            reach: 0,
+        };
+        local.reach = local.reach(-LOG2_E * (splat.cut + CUT_SLACK));
+        local
     }
 
-    /// `dx` of each pixel of a row, the same in all rows.
+    /// Vectors of which some point lies where the exponent is at least `cut`: its maximum along a row is that of a parabola.
     #[inline(always)]
-    pub(crate) fn dx(&self) -> [Lane; ROW_VECTORS] {
-        let mut dx = [[0.0; LANES]; ROW_VECTORS];
-        for (k, dx) in dx.as_flattened_mut().iter_mut().enumerate() {
-            *dx = self.x - k as f32;
+    fn reach(&self, cut: f32) -> u32 {
+        let ridge = -0.5 * self.b / self.half_a;
+        let mut bits = [0u32; TILE_VECTORS];
+        for (v, bit) in bits.iter_mut().enumerate() {
+            let (high, dy) = self.offset_to(v);
+            let low = high - (LANES - 1) as f32;
+            let dx = ridge * dy;
+            let dx = if dx < low { low } else { dx };
+            let dx = if dx > high { high } else { dx };
+            let exponent = (self.half_a * dx + self.b * dy) * dx + self.half_c * dy * dy;
+            *bit = if exponent < cut { 0 } else { 1 << v };
         }
-        dx
+        bits.iter().fold(0, |all, bit| all | bit)
     }
 
-    /// Alpha of a pixel, and whether it is below the clamp. `raster_backward` must come to the same bits.
+    /// From the centre of a vector's first pixel to the splat's centre.
+    #[inline(always)]
+    pub(crate) fn offset_to(&self, v: usize) -> (f32, f32) {
+        let (row, half) = (v / ROW_VECTORS, v % ROW_VECTORS);
+        (self.x - (half * LANES) as f32, self.y - row as f32)
+    }
+
+    /// Vectors of the tile that the splat reaches.
+    #[inline(always)]
+    pub(crate) fn vectors(&self) -> impl Iterator<Item = usize> {
+        let mut left = self.reach;
+        std::iter::from_fn(move || {
+            let v = left.trailing_zeros();
+            left &= left.wrapping_sub(1);
+            (v < u32::BITS).then_some(v as usize)
+        })
+    }
+
+    /// Alpha of a pixel, 0 where it is too faint to count, and whether it is below the upper clamp.
+    /// `raster_backward` must come to the same bits.
     #[inline(always)]
     pub(crate) fn alpha<const FMA: bool>(&self, dx: f32, dy: f32) -> (f32, bool) {
         let along_x = madd::<FMA>(self.half_a, dx, self.b * dy);
         let exponent = madd::<FMA>(along_x, dx, self.half_c * dy * dy);
         let alpha = self.opacity * exp2::<FMA>(exponent);
+        // Rounding may take the exponent of a needle above 0, where the Gaussian has no value; NaN is out too.
+        let is_seen = (alpha >= MIN_ALPHA) & (exponent <= 0.0);
         let is_free = alpha <= MAX_ALPHA;
-        let alpha = if is_free { alpha } else { MAX_ALPHA };
-        // Rounding may take the exponent of a needle above 0, where the Gaussian has no value; NaN goes here too.
-        let alpha = if exponent <= 0.0 { alpha } else { 0.0 };
-        (alpha, is_free)
+        let clamped = if is_free { alpha } else { MAX_ALPHA };
+        (if is_seen { clamped } else { 0.0 }, is_free)
     }
 }
 
@@ -284,9 +363,16 @@ impl Raster {
         };
         for y in 0..self.height_px {
             let [r, g, b, alpha, depth_sum] = std::array::from_fn(|p| self.row(p, y));
-            rendering.rgb.extend(r.iter().zip(g).zip(b).flat_map(|((&r, &g), &b)| [r, g, b]));
+            rendering
+                .rgb
+                .extend(r.iter().zip(g).zip(b).flat_map(|((&r, &g), &b)| [r, g, b]));
             rendering.alpha.extend_from_slice(alpha);
-            rendering.depth.extend(depth_sum.iter().zip(alpha).map(|(&d, &a)| if a > 0.0 { d / a } else { 0.0 }));
+            rendering.depth.extend(
+                depth_sum
+                    .iter()
+                    .zip(alpha)
+                    .map(|(&d, &a)| if a > 0.0 { d / a } else { 0.0 }),
+            );
         }
         rendering
     }

@@ -8,9 +8,10 @@ use multiversion::multiversion;
 use super::bin::Tiles;
 use super::lanes::{LANES, Lane, madd};
 use super::loss::PixelGradients;
-use super::project::{MIN_ALPHA, ProjectedSplat, TILE_PX};
+use super::project::{ProjectedSplat, TILE_PX};
 use super::raster::{
-    MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea, TilePixels, TileSplat, start_transmittance,
+    BATCH, MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea,
+    TilePixels, TileSplat, load_batch, start_transmittance,
 };
 
 /// d loss / d one instance.
@@ -66,8 +67,15 @@ pub fn raster_backward(
         n_slots += tile.n_used;
         out.starts.push(n_slots);
     }
-    out.slots.resize(n_slots as usize, InstanceGradient::default());
-    let job = Job { visible, tiles, raster, pixels, starts: &out.starts };
+    out.slots
+        .resize(n_slots as usize, InstanceGradient::default());
+    let job = Job {
+        visible,
+        tiles,
+        raster,
+        pixels,
+        starts: &out.starts,
+    };
     job.run(0, raster.tiles.len(), &mut out.slots);
 }
 
@@ -85,17 +93,32 @@ impl Job<'_> {
     fn run(self, first: usize, end: usize, slots: &mut [InstanceGradient]) {
         if end - first > 1 {
             let middle = usize::midpoint(first, end);
-            let (left, right) = slots.split_at_mut((self.starts[middle] - self.starts[first]) as usize);
-            rayon::join(|| self.run(first, middle, left), || self.run(middle, end, right));
+            let (left, right) =
+                slots.split_at_mut((self.starts[middle] - self.starts[first]) as usize);
+            rayon::join(
+                || self.run(first, middle, left),
+                || self.run(middle, end, right),
+            );
         } else if first < end && !slots.is_empty() {
             let area = self.tiles.area(first);
-            let mut gradients = TileGradients::load(self.raster, self.pixels, &self.raster.tiles[first], area);
-            raster_backward_tile(self.visible, self.tiles.of(first), area, &mut gradients, slots);
+            let mut gradients =
+                TileGradients::load(self.raster, self.pixels, &self.raster.tiles[first], area);
+            raster_backward_tile(
+                self.visible,
+                self.tiles.of(first),
+                area,
+                &mut gradients,
+                slots,
+            );
         }
     }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
 fn raster_backward_tile(
     visible: &[ProjectedSplat],
     instances: &[u32],
@@ -118,51 +141,50 @@ fn walk<const FMA: bool>(
     pixels: &mut TileGradients,
     out: &mut [InstanceGradient],
 ) {
-    for (&ix, out) in instances.iter().zip(out) {
-        let splat = &visible[ix as usize];
-        let local = TileSplat::new(splat, area);
-        let dx = local.dx();
-        let mut sums = ColumnSums::default();
-        for row in local.rows.clone() {
-            let dy = local.y - row as f32;
-            for half in local.vectors.clone() {
-                add_pixels::<FMA>(splat, &local, &dx[half], dy, (row, half), pixels, &mut sums);
+    let mut batch = [TileSplat::NONE; BATCH];
+    for (instances, out) in instances.chunks(BATCH).zip(out.chunks_mut(BATCH)) {
+        let splats = load_batch(visible, &instances[..out.len()], area, &mut batch);
+        for ((splat, out), &ix) in splats.iter().zip(out).zip(instances) {
+            let mut sums = ColumnSums::default();
+            for v in splat.vectors() {
+                add_pixels::<FMA>(splat, v, pixels, &mut sums);
             }
+            *out = sums.gradient(splat, visible[ix as usize].conic);
         }
-        *out = sums.gradient(splat, &dx);
     }
 }
 
-/// One vector of pixels.
+/// One vector of pixels; locals for the reason given at `raster`'s.
 #[inline(always)]
-#[expect(clippy::too_many_arguments, reason = "inlined: the body of two loops")]
 fn add_pixels<const FMA: bool>(
-    splat: &ProjectedSplat,
-    local: &TileSplat,
-    dx: &Lane,
-    dy: f32,
-    (row, half): (usize, usize),
+    splat: &TileSplat,
+    p: usize,
     pixels: &mut TileGradients,
     sums: &mut ColumnSums,
 ) {
-    let p = row * ROW_VECTORS + half;
+    let half = p % ROW_VECTORS;
+    let (x, dy) = splat.offset_to(p);
+    let [red, green, blue] = splat.color;
     let (mut t, mut behind) = (pixels.transmittance[p], pixels.behind[p]);
     let [v_r, v_g, v_b, v_z] = pixels.v.each_ref().map(|v| v[p]);
     let [mut m0, mut m1, mut m2] = sums.moments.each_ref().map(|m| m[half]);
     let [mut sum_r, mut sum_g, mut sum_b, mut sum_z] = sums.channels.each_ref().map(|c| c[half]);
     for i in 0..LANES {
-        let (alpha, is_free) = local.alpha::<FMA>(dx[i], dy);
+        let (alpha, is_free) = splat.alpha::<FMA>(x - i as f32, dy);
         let next = t[i] * (1.0 - alpha);
-        let is_seen = alpha >= MIN_ALPHA;
         let is_over = next <= MIN_TRANSMITTANCE;
-        let is_added = is_seen && !is_over;
-        let weight = if is_added { alpha * t[i] } else { 0.0 };
-        let seen = madd::<FMA>(splat.color[0], v_r[i], splat.color[1] * v_g[i]);
-        let seen = madd::<FMA>(splat.color[2], v_b[i], seen);
+        let weight = if is_over { 0.0 } else { alpha * t[i] };
+        let seen = madd::<FMA>(red, v_r[i], green * v_g[i]);
+        let seen = madd::<FMA>(blue, v_b[i], seen);
         let seen = madd::<FMA>(splat.depth, v_z[i], seen);
         behind[i] = madd::<FMA>(-weight, seen, behind[i]);
         let v_alpha = madd::<FMA>(t[i], seen, -behind[i] / (1.0 - alpha));
-        let v_sigma = if is_added && is_free { -alpha * v_alpha } else { 0.0 };
+        // Alpha 0 stands for a pixel that the splat does not reach.
+        let v_sigma = if is_free & !is_over {
+            -alpha * v_alpha
+        } else {
+            0.0
+        };
         m0[i] += v_sigma;
         m1[i] = madd::<FMA>(v_sigma, dy, m1[i]);
         m2[i] = madd::<FMA>(v_sigma, dy * dy, m2[i]);
@@ -170,8 +192,7 @@ fn add_pixels<const FMA: bool>(
         sum_g[i] = madd::<FMA>(weight, v_g[i], sum_g[i]);
         sum_b[i] = madd::<FMA>(weight, v_b[i], sum_b[i]);
         sum_z[i] = madd::<FMA>(weight, v_z[i], sum_z[i]);
-        let stopped = if is_over { -t[i].abs() } else { next };
-        t[i] = if is_seen { stopped } else { t[i] };
+        t[i] = if is_over { -t[i].abs() } else { next };
     }
     pixels.transmittance[p] = t;
     pixels.behind[p] = behind;
@@ -185,19 +206,18 @@ fn add_pixels<const FMA: bool>(
 
 impl ColumnSums {
     #[inline(always)]
-    fn gradient(&self, splat: &ProjectedSplat, dx: &[Lane; ROW_VECTORS]) -> InstanceGradient {
-        let dx = dx.as_flattened();
+    fn gradient(&self, splat: &TileSplat, [a, b, c]: [f32; 3]) -> InstanceGradient {
         let [m0, m1, m2] = self.moments.each_ref().map(|m| m.as_flattened());
         let mut moment_x = [0.0; TILE_PX];
         let mut moment_xx = [0.0; TILE_PX];
         let mut moment_xy = [0.0; TILE_PX];
         for i in 0..TILE_PX {
-            moment_x[i] = m0[i] * dx[i];
-            moment_xx[i] = m0[i] * dx[i] * dx[i];
-            moment_xy[i] = m1[i] * dx[i];
+            let dx = splat.x - i as f32;
+            moment_x[i] = m0[i] * dx;
+            moment_xx[i] = m0[i] * dx * dx;
+            moment_xy[i] = m1[i] * dx;
         }
         let (sum, x, y) = (total(m0), total(&moment_x), total(m1));
-        let [a, b, c] = splat.conic;
         let [red, green, blue, depth] = self.channels.each_ref().map(|c| total(c.as_flattened()));
         InstanceGradient {
             center: [a * x + b * y, b * x + c * y],
@@ -223,12 +243,20 @@ fn total(lanes: &[f32]) -> f32 {
 }
 
 impl TileGradients {
-    fn load(raster: &Raster, gradients: &PixelGradients, tile: &TilePixels, area: TileArea) -> Self {
+    fn load(
+        raster: &Raster,
+        gradients: &PixelGradients,
+        tile: &TilePixels,
+        area: TileArea,
+    ) -> Self {
         let mut v = [[[0.0; LANES]; TILE_VECTORS]; 4];
         let mut behind = [[0.0; LANES]; TILE_VECTORS];
         for row in 0..area.n_rows {
             let first = (area.y + row) * raster.stride + PLANE_MARGIN + area.x;
-            let [v_r, v_g, v_b, v_a, v_z] = gradients.planes.each_ref().map(|plane| &plane[first..][..area.n_columns]);
+            let [v_r, v_g, v_b, v_a, v_z] = gradients
+                .planes
+                .each_ref()
+                .map(|plane| &plane[first..][..area.n_columns]);
             for (v, from) in v.iter_mut().zip([v_r, v_g, v_b, v_z]) {
                 v.as_flattened_mut()[row * TILE_PX..][..area.n_columns].copy_from_slice(from);
             }
@@ -236,9 +264,14 @@ impl TileGradients {
             for (x, (behind, v_a)) in behind.iter_mut().zip(v_a).enumerate() {
                 let at = |plane: &[Lane; TILE_VECTORS]| plane.as_flattened()[row * TILE_PX + x];
                 let [r, g, b] = tile.rgb.each_ref().map(at);
-                *behind = r * v_r[x] + g * v_g[x] + b * v_b[x] + at(&tile.depth_sum) * v_z[x] - at(&tile.transmittance) * v_a;
+                *behind = r * v_r[x] + g * v_g[x] + b * v_b[x] + at(&tile.depth_sum) * v_z[x]
+                    - at(&tile.transmittance) * v_a;
             }
         }
-        Self { v, behind, transmittance: start_transmittance(area) }
+        Self {
+            v,
+            behind,
+            transmittance: start_transmittance(area),
+        }
     }
 }

@@ -8,8 +8,13 @@ pub(crate) const MAX_COEFFICIENTS: usize = 16;
 
 const C0: f64 = 0.282_094_791_773_878_14;
 const C1: f64 = 0.488_602_511_902_919_9;
-const C2: [f64; 5] =
-    [1.092_548_430_592_079_2, -1.092_548_430_592_079_2, 0.315_391_565_252_520_05, -1.092_548_430_592_079_2, 0.546_274_215_296_039_6];
+const C2: [f64; 5] = [
+    1.092_548_430_592_079_2,
+    -1.092_548_430_592_079_2,
+    0.315_391_565_252_520_05,
+    -1.092_548_430_592_079_2,
+    0.546_274_215_296_039_6,
+];
 const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
     2.890_611_442_640_554,
@@ -101,7 +106,10 @@ mod tests {
                 let mut step = DVec3::ZERO;
                 step[axis] = 1e-5;
                 let expected = (basis(dir + step, 3)[band] - basis(dir - step, 3)[band]) / 2e-5;
-                assert!((found[axis] - expected).abs() < TOLERANCE, "band {band} axis {axis}");
+                assert!(
+                    (found[axis] - expected).abs() < TOLERANCE,
+                    "band {band} axis {axis}"
+                );
             }
         }
     }

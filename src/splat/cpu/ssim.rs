@@ -12,8 +12,17 @@ pub(crate) const REACH: usize = TAPS / 2;
 
 /// Normalised Gaussian, sigma 1.5 px.
 const WINDOW: [f32; TAPS] = [
-    0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72, 0.213_005_54, 0.109_360_69,
-    0.036_000_773, 0.007_598_758, 0.001_028_38,
+    0.001_028_38,
+    0.007_598_758,
+    0.036_000_773,
+    0.109_360_69,
+    0.213_005_54,
+    0.266_011_72,
+    0.213_005_54,
+    0.109_360_69,
+    0.036_000_773,
+    0.007_598_758,
+    0.001_028_38,
 ];
 /// Stabilisers for values of range 1.
 const C1: f32 = 1e-4;
@@ -34,7 +43,11 @@ pub(crate) fn shifted(row: &[f32], n: usize) -> Window<'_> {
     std::array::from_fn(|t| &row[t..t + n])
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
 pub(crate) fn blur(window: &Window<'_>, out: &mut [f32]) {
     multiversion::target::match_target! {
         "x86_64+avx2+fma" => blur_with::<true>(window, out),
@@ -57,7 +70,11 @@ fn blur_with<const FMA: bool>(window: &Window<'_>, out: &mut [f32]) {
 }
 
 /// Blurs the product of two rows.
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
 pub(crate) fn blur_product(x: &Window<'_>, y: &Window<'_>, out: &mut [f32]) {
     multiversion::target::match_target! {
         "x86_64+avx2+fma" => blur_product_with::<true>(x, y, out),
@@ -81,8 +98,18 @@ fn blur_product_with<const FMA: bool>(x: &Window<'_>, y: &Window<'_>, out: &mut 
 }
 
 /// Blurred x, y, x^2, y^2, xy of a row become p, q, r of `gradient_row` and, in `yy`, SSIM itself.
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(crate) fn terms_in_place(x: &mut [f32], y: &mut [f32], xx: &mut [f32], yy: &mut [f32], xy: &mut [f32]) {
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
+pub(crate) fn terms_in_place(
+    x: &mut [f32],
+    y: &mut [f32],
+    xx: &mut [f32],
+    yy: &mut [f32],
+    xy: &mut [f32],
+) {
     let n = x.len();
     let (y, xx, yy, xy) = (&mut y[..n], &mut xx[..n], &mut yy[..n], &mut xy[..n]);
     for i in 0..n {
@@ -106,8 +133,18 @@ pub(crate) fn terms_in_place(x: &mut [f32], y: &mut [f32], xx: &mut [f32], yy: &
 }
 
 /// `weights[0] * sign(x - y) + weights[1] * dSSIM/dx` of a row.
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(crate) fn gradient_row(terms: &Terms<'_>, x: &[f32], y: &[f32], weights: [f32; 2], out: &mut [f32]) {
+#[multiversion(targets(
+    "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
+    "x86_64+avx2+fma",
+    "aarch64+neon"
+))]
+pub(crate) fn gradient_row(
+    terms: &Terms<'_>,
+    x: &[f32],
+    y: &[f32],
+    weights: [f32; 2],
+    out: &mut [f32],
+) {
     multiversion::target::match_target! {
         "x86_64+avx2+fma" => gradient_row_with::<true>(terms, x, y, weights, out),
         "aarch64+neon" => gradient_row_with::<true>(terms, x, y, weights, out),
@@ -116,7 +153,13 @@ pub(crate) fn gradient_row(terms: &Terms<'_>, x: &[f32], y: &[f32], weights: [f3
 }
 
 #[inline(always)]
-fn gradient_row_with<const FMA: bool>(terms: &Terms<'_>, x: &[f32], y: &[f32], weights: [f32; 2], out: &mut [f32]) {
+fn gradient_row_with<const FMA: bool>(
+    terms: &Terms<'_>,
+    x: &[f32],
+    y: &[f32],
+    weights: [f32; 2],
+    out: &mut [f32],
+) {
     let n = out.len();
     let (x, y) = (&x[..n], &y[..n]);
     let p: Window<'_> = std::array::from_fn(|t| &terms.p[t][..n]);

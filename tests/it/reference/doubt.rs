@@ -95,7 +95,11 @@ fn candidate(params: &Params, camera: &Camera, splat: Projected) -> Candidate {
             + 4.0 * ROUNDING * (focal * slope + centre.abs())
     });
     // Relative errors of the Jacobian and of exp(log_scale) come in squared.
-    let largest_log_scale = Vector3::from(params.log_scales[splat.splat_ix]).amax();
+    let log_scales = params.log_scales[splat.splat_ix].into_iter();
+    let largest_log_scale = log_scales
+        .filter(|log_scale| log_scale.is_finite())
+        .map(f64::abs)
+        .fold(0.0, f64::max);
     let relative = ROUNDING * (4.0 + largest_log_scale) + 2.0 * mean_error.norm() / z;
     let covariance_error =
         relative * splat.jacobian.norm_squared() * splat.covariance_in_cam.trace();

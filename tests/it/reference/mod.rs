@@ -4,6 +4,7 @@
 pub mod adam;
 pub mod bin;
 pub mod doubt;
+pub mod hostile;
 pub mod loss;
 pub mod project;
 pub mod project_backward;

@@ -8,6 +8,8 @@ pub const NEAR: f64 = 0.01;
 /// Variance in px^2 added to each 2D Gaussian, so that none falls between pixel centres.
 pub const BLUR: f64 = 0.3;
 pub const MIN_OPACITY: f64 = 1.0 / 255.0;
+/// A colour beyond this is a broken splat; squared it would take a whole picture's SSIM with it.
+const MAX_COLOUR: f64 = 1e4;
 
 #[derive(Debug, Clone)]
 pub struct Projected {
@@ -77,23 +79,23 @@ fn project_one(
     let stride = params.sh_stride();
     let n_active = 3 * (usize::from(sh_degree.min(params.sh_degree)) + 1).pow(2);
     let sh = &params.sh[splat_ix * stride..splat_ix * stride + n_active];
-    let numbers = mean
-        .iter()
-        .chain(&log_scale)
-        .chain(&quat)
-        .chain(sh)
-        .chain(std::iter::once(&logit));
-    if !numbers.copied().all(f64::is_finite) {
+    let (scale, opacity) = (log_scale.map(f64::exp), sigmoid(logit));
+    // After activation: an infinite logit is an opacity of 0 or 1, a log-scale of minus infinity is a point.
+    let numbers = mean.iter().chain(&scale).chain(&quat).chain(sh);
+    if opacity.is_nan()
+        || !numbers
+            .copied()
+            .all(|number| number.abs() <= f64::from(f32::MAX))
+    {
         return None;
     }
 
     let mean_in_cam = camera.rotation * mean + camera.translation;
-    let opacity = sigmoid(logit);
     if mean_in_cam.z <= limits.near || opacity < limits.min_opacity {
         return None;
     }
 
-    let half = rotation(quat) * Matrix3::from_diagonal(&log_scale.map(f64::exp));
+    let half = rotation(quat) * Matrix3::from_diagonal(&scale);
     let covariance_in_cam = camera.rotation * half * half.transpose() * camera.rotation.transpose();
     let (slope, is_clamped) = limited_slope(camera, mean_in_cam);
     let jacobian = jacobian(camera, mean_in_cam.z, slope);
@@ -120,6 +122,9 @@ fn project_one(
     let distance = from_centre.norm();
     let direction_in_map = from_centre / distance;
     let raw = colour(sh, direction_in_map);
+    if raw.amax() >= MAX_COLOUR {
+        return None;
+    }
     Some(Projected {
         splat_ix,
         mean_in_cam,
