@@ -119,7 +119,8 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {
-        let fault = read_bytes(folder.path(), &bytes[..cut]).err().expect("half a map was read");
+        // Without the map itself, which fills screens when this fails.
+        let fault = read_bytes(folder.path(), &bytes[..cut]).map(|_| "half a map was read").unwrap_err();
         assert!(matches!(fault, CheckpointError::Damaged { .. }), "cut at {cut}: {fault}");
     }
     assert!(read_bytes(folder.path(), &[&bytes[..], &[0]].concat()).is_err());
