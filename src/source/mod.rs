@@ -83,13 +83,6 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
-        Some(("v4l2" | "webcam", _)) => {
-            not_in_build("record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH")
-        }
-        Some(("ros2" | "zenoh", _)) => {
-            not_in_build("record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH")
-        }
-        Some(("synthetic", scene)) => open_synthetic(uri, scene, params, seed),
         Some(("v4l2" | "webcam", _)) => not_in_build(
             "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
         ),
@@ -108,17 +101,14 @@ fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, So
     Ok(Box::new(images::ImagesSource::open(path, params)?))
 }
 
-fn open_synthetic(scene: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
-    Ok(Box::new(synthetic::SyntheticSource::open(scene, params, seed)?))
 fn open_synthetic(
-    uri: &str,
-    _scene: &str,
-    _params: &SourceParams,
-    _seed: u64,
+    scene: &str,
+    params: &SourceParams,
+    seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
-    Err(SourceError::Uri {
-        uri: uri.to_owned(),
-    })
+    Ok(Box::new(synthetic::SyntheticSource::open(
+        scene, params, seed,
+    )?))
 }
 
 /// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.
@@ -182,40 +172,32 @@ fn read_small(path: &Path, max_bytes: u64) -> Result<Vec<u8>, String> {
 fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a, b);
     loop {
-        let (text_a, text_b) = (
-            head(a, |c| !c.is_ascii_digit()),
-            head(b, |c| !c.is_ascii_digit()),
-        );
-        let by_text = text_a.cmp(text_b);
-        if by_text != Ordering::Equal {
-            return by_text;
-        }
-        (a, b) = (&a[text_a.len()..], &b[text_b.len()..]);
-        let (digits_a, digits_b) = (
-            head(a, |c| c.is_ascii_digit()),
-            head(b, |c| c.is_ascii_digit()),
-        );
-        let (number_a, number_b) = (
-            digits_a.trim_start_matches('0'),
-            digits_b.trim_start_matches('0'),
-        );
-        let by_number = number_a
-            .len()
-            .cmp(&number_b.len())
-            .then_with(|| number_a.cmp(number_b));
-        if by_number != Ordering::Equal {
-            return by_number;
-        }
-        (a, b) = (&a[digits_a.len()..], &b[digits_b.len()..]);
-        if a.is_empty() && b.is_empty() {
-            return Ordering::Equal;
-        }
+        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let (char_a, char_b) = (a.chars().next(), b.chars().next());
+        let order = if digits_a.is_empty() || digits_b.is_empty() {
+            char_a.cmp(&char_b)
+        } else {
+            let (number_a, number_b) = (
+                digits_a.trim_start_matches('0'),
+                digits_b.trim_start_matches('0'),
+            );
+            number_a
+                .len()
+                .cmp(&number_b.len())
+                .then_with(|| number_a.cmp(number_b))
+        };
+        let (Ordering::Equal, Some(char_a), Some(char_b)) = (order, char_a, char_b) else {
+            return order;
+        };
+        a = &a[digits_a.len().max(char_a.len_utf8())..];
+        b = &b[digits_b.len().max(char_b.len_utf8())..];
     }
 }
 
-/// The longest beginning whose characters all fit.
-fn head(text: &str, fits: impl Fn(char) -> bool) -> &str {
-    &text[..text.find(|c| !fits(c)).unwrap_or(text.len())]
+fn leading_digits(text: &str) -> &str {
+    &text[..text
+        .find(|c: char| !c.is_ascii_digit())
+        .unwrap_or(text.len())]
 }
 
 #[cfg(test)]

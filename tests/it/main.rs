@@ -2,6 +2,7 @@
 #![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+
 #[cfg(feature = "zenoh")]
 
 mod backends;
@@ -29,5 +30,6 @@ mod sfm;
 mod shaders;
 mod sources;
 mod synthetic;
+mod synthetic_source;
 mod topics;
 mod trajectory;

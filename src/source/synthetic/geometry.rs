@@ -12,12 +12,23 @@ pub(super) const MIN_DISTANCE: f64 = 1e-4;
 
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Shape {
-    Block { half: DVec3 },
+    Block {
+        half: DVec3,
+    },
     /// A cone cut off at both ends, closed, its axis along z.
-    Tube { half_height: f64, bottom: f64, top: f64 },
-    Ball { radii: DVec3 },
+    Tube {
+        half_height: f64,
+        bottom: f64,
+        top: f64,
+    },
+    Ball {
+        radii: DVec3,
+    },
     /// A flat piece in the xy plane that looks along +z; `round` cuts it to an ellipse. Seen from both sides.
-    Sheet { half: DVec2, round: bool },
+    Sheet {
+        half: DVec2,
+        round: bool,
+    },
 }
 
 /// Where a solid stands.
@@ -40,7 +51,6 @@ pub(super) struct FacePoint {
     pub(super) uv: DVec2,
     pub(super) half: DVec2,
     pub(super) normal: DVec3,
-    pub(super) local: DVec3,
 }
 
 impl Placed {
@@ -51,7 +61,11 @@ impl Placed {
         let direction = local_from_world * ray.direction;
         let met = match self.shape {
             Shape::Block { half } => meet_block(origin, direction, half),
-            Shape::Tube { half_height, bottom, top } => meet_tube(origin, direction, [half_height, bottom, top]),
+            Shape::Tube {
+                half_height,
+                bottom,
+                top,
+            } => meet_tube(origin, direction, [half_height, bottom, top]),
             Shape::Ball { radii } => meet_ball(origin, direction, radii),
             Shape::Sheet { half, round } => meet_sheet(origin, direction, half, round),
         };
@@ -63,16 +77,28 @@ impl Placed {
         let local = self.world_from_local.transpose() * (point - self.centre);
         let (uv, half, normal) = match self.shape {
             Shape::Block { half } => block_face(local, half, face),
-            Shape::Tube { half_height, bottom, top } => tube_face(local, [half_height, bottom, top], face),
+            Shape::Tube {
+                half_height,
+                bottom,
+                top,
+            } => tube_face(local, [half_height, bottom, top], face),
             Shape::Ball { radii } => {
                 let radius = radii.max_element();
                 let unit = local / radii;
                 let uv = DVec2::new(unit.y.atan2(unit.x), unit.z.clamp(-1.0, 1.0).asin()) * radius;
-                (uv, DVec2::new(PI, PI / 2.0) * radius, (unit / radii).normalize())
+                (
+                    uv,
+                    DVec2::new(PI, PI / 2.0) * radius,
+                    (unit / radii).normalize(),
+                )
             }
             Shape::Sheet { half, .. } => (local.truncate(), half, DVec3::Z),
         };
-        FacePoint { uv, half, normal: self.world_from_local * normal, local }
+        FacePoint {
+            uv,
+            half,
+            normal: self.world_from_local * normal,
+        }
     }
 
     pub(super) fn n_faces(&self) -> u8 {
@@ -87,7 +113,11 @@ impl Placed {
     pub(super) fn face_half(&self, face: u8) -> DVec2 {
         match self.shape {
             Shape::Block { half } => block_face(DVec3::ZERO, half, face).1,
-            Shape::Tube { half_height, bottom, top } => tube_face(DVec3::X, [half_height, bottom, top], face).1,
+            Shape::Tube {
+                half_height,
+                bottom,
+                top,
+            } => tube_face(DVec3::X, [half_height, bottom, top], face).1,
             Shape::Ball { radii } => DVec2::new(PI, PI / 2.0) * radii.max_element(),
             Shape::Sheet { half, .. } => half,
         }
@@ -107,7 +137,11 @@ impl Placed {
                     _ => DVec3::new(uv.x, -uv.y, -half.z),
                 }
             }
-            Shape::Tube { half_height, bottom, top } => match face {
+            Shape::Tube {
+                half_height,
+                bottom,
+                top,
+            } => match face {
                 0 => {
                     let (sin, cos) = (scaled.x * PI).sin_cos();
                     let radius = 0.5 * (bottom + top) + 0.5 * (top - bottom) * scaled.y;
@@ -131,7 +165,11 @@ impl Placed {
     pub(super) fn bounds(&self) -> (DVec3, DVec3) {
         let half = match self.shape {
             Shape::Block { half } => half,
-            Shape::Tube { half_height, bottom, top } => DVec3::new(bottom.max(top), bottom.max(top), half_height),
+            Shape::Tube {
+                half_height,
+                bottom,
+                top,
+            } => DVec3::new(bottom.max(top), bottom.max(top), half_height),
             Shape::Ball { radii } => radii,
             Shape::Sheet { half, .. } => half.extend(0.0),
         };
@@ -154,12 +192,22 @@ fn meet_block(origin: DVec3, direction: DVec3, half: DVec3) -> Option<(f64, u8)>
     // From inside the ray meets the far side, so that points within a block count as covered.
     let inside = enter <= MIN_DISTANCE;
     let (distance, per_axis) = if inside { (exit, far) } else { (enter, near) };
-    let axis = if per_axis.x == distance { 0 } else if per_axis.y == distance { 1 } else { 2 };
+    let axis = if per_axis.x == distance {
+        0
+    } else if per_axis.y == distance {
+        1
+    } else {
+        2
+    };
     let positive = (direction[axis] > 0.0) == inside;
     Some((distance, axis as u8 * 2 + u8::from(!positive)))
 }
 
-fn meet_tube(origin: DVec3, direction: DVec3, [half_height, bottom, top]: [f64; 3]) -> Option<(f64, u8)> {
+fn meet_tube(
+    origin: DVec3,
+    direction: DVec3,
+    [half_height, bottom, top]: [f64; 3],
+) -> Option<(f64, u8)> {
     let middle = 0.5 * (bottom + top);
     let slope = (top - bottom) / (2.0 * half_height);
     let radius = middle + slope * origin.z;
@@ -215,34 +263,78 @@ fn meet_sheet(origin: DVec3, direction: DVec3, half: DVec2, round: bool) -> Opti
         return None;
     }
     let scaled = (origin + direction * distance).truncate() / half;
-    let inside = if round { scaled.length_squared() <= 1.0 } else { scaled.abs().max_element() <= 1.0 };
+    let inside = if round {
+        scaled.length_squared() <= 1.0
+    } else {
+        scaled.abs().max_element() <= 1.0
+    };
     inside.then_some((distance, 0))
 }
 
 /// (uv, half, normal); u runs to the right and v up for someone who looks at the face from outside.
 fn block_face(local: DVec3, half: DVec3, face: u8) -> (DVec2, DVec2, DVec3) {
     match face {
-        0 => (DVec2::new(local.y, local.z), DVec2::new(half.y, half.z), DVec3::X),
-        1 => (DVec2::new(-local.y, local.z), DVec2::new(half.y, half.z), DVec3::NEG_X),
-        2 => (DVec2::new(-local.x, local.z), DVec2::new(half.x, half.z), DVec3::Y),
-        3 => (DVec2::new(local.x, local.z), DVec2::new(half.x, half.z), DVec3::NEG_Y),
-        4 => (DVec2::new(local.x, local.y), DVec2::new(half.x, half.y), DVec3::Z),
-        _ => (DVec2::new(local.x, -local.y), DVec2::new(half.x, half.y), DVec3::NEG_Z),
+        0 => (
+            DVec2::new(local.y, local.z),
+            DVec2::new(half.y, half.z),
+            DVec3::X,
+        ),
+        1 => (
+            DVec2::new(-local.y, local.z),
+            DVec2::new(half.y, half.z),
+            DVec3::NEG_X,
+        ),
+        2 => (
+            DVec2::new(-local.x, local.z),
+            DVec2::new(half.x, half.z),
+            DVec3::Y,
+        ),
+        3 => (
+            DVec2::new(local.x, local.z),
+            DVec2::new(half.x, half.z),
+            DVec3::NEG_Y,
+        ),
+        4 => (
+            DVec2::new(local.x, local.y),
+            DVec2::new(half.x, half.y),
+            DVec3::Z,
+        ),
+        _ => (
+            DVec2::new(local.x, -local.y),
+            DVec2::new(half.x, half.y),
+            DVec3::NEG_Z,
+        ),
     }
 }
 
 /// Faces: 0 side, 1 top, 2 bottom.
-fn tube_face(local: DVec3, [half_height, bottom, top]: [f64; 3], face: u8) -> (DVec2, DVec2, DVec3) {
+fn tube_face(
+    local: DVec3,
+    [half_height, bottom, top]: [f64; 3],
+    face: u8,
+) -> (DVec2, DVec2, DVec3) {
     match face {
         0 => {
             let radius = bottom.max(top);
             let uv = DVec2::new(local.y.atan2(local.x) * radius, local.z);
             let slope = (top - bottom) / (2.0 * half_height);
             let out = local.truncate().normalize_or_zero();
-            (uv, DVec2::new(PI * radius, half_height), out.extend(-slope).normalize())
+            (
+                uv,
+                DVec2::new(PI * radius, half_height),
+                out.extend(-slope).normalize(),
+            )
         }
-        1 => (local.truncate(), DVec2::splat(top.max(1e-6) * 0.7), DVec3::Z),
-        _ => (local.truncate(), DVec2::splat(bottom.max(1e-6) * 0.7), DVec3::NEG_Z),
+        1 => (
+            local.truncate(),
+            DVec2::splat(top.max(1e-6) * 0.7),
+            DVec3::Z,
+        ),
+        _ => (
+            local.truncate(),
+            DVec2::splat(bottom.max(1e-6) * 0.7),
+            DVec3::NEG_Z,
+        ),
     }
 }
 
@@ -260,10 +352,19 @@ mod tests {
             for scaled in [DVec2::new(0.3, -0.6), DVec2::new(-0.45, 0.2)] {
                 let (point, normal) = placed.point_on_face(face, scaled);
                 let found = placed.face_point(point, face);
-                assert!((found.uv / found.half - scaled).length() < 1e-9, "{shape:?} face {face}: {found:?}");
-                let ray = Ray { origin: point + normal * 0.5, direction: -normal };
+                assert!(
+                    (found.uv / found.half - scaled).length() < 1e-9,
+                    "{shape:?} face {face}: {found:?}"
+                );
+                let ray = Ray {
+                    origin: point + normal * 0.5,
+                    direction: -normal,
+                };
                 let (distance, met) = placed.meet(&ray, 1e9).unwrap();
-                assert!((distance - 0.5).abs() < 1e-9, "{shape:?} face {face}: {distance}");
+                assert!(
+                    (distance - 0.5).abs() < 1e-9,
+                    "{shape:?} face {face}: {distance}"
+                );
                 assert_eq!(met, face);
             }
         }
@@ -271,10 +372,21 @@ mod tests {
 
     #[test]
     fn a_ray_along_the_normal_meets_the_point_it_started_over() {
-        check_round_trip(Shape::Block { half: DVec3::new(0.5, 0.7, 0.2) });
-        check_round_trip(Shape::Tube { half_height: 0.4, bottom: 0.3, top: 0.2 });
-        check_round_trip(Shape::Ball { radii: DVec3::splat(0.6) });
-        check_round_trip(Shape::Sheet { half: DVec2::new(0.8, 0.5), round: true });
+        check_round_trip(Shape::Block {
+            half: DVec3::new(0.5, 0.7, 0.2),
+        });
+        check_round_trip(Shape::Tube {
+            half_height: 0.4,
+            bottom: 0.3,
+            top: 0.2,
+        });
+        check_round_trip(Shape::Ball {
+            radii: DVec3::splat(0.6),
+        });
+        check_round_trip(Shape::Sheet {
+            half: DVec2::new(0.8, 0.5),
+            round: true,
+        });
     }
 
     #[test]

@@ -52,7 +52,8 @@ fn letter_ink(letter: char, at: Vec2, footprint: f32) -> f32 {
         for dx in -1..=1 {
             if is_set(column + dx, row + dy) {
                 let cover = |x: f32, d: i32| {
-                    edge(d as f32, x, footprint.max(0.05)) - edge((d + 1) as f32, x, footprint.max(0.05))
+                    edge(d as f32, x, footprint.max(0.05))
+                        - edge((d + 1) as f32, x, footprint.max(0.05))
                 };
                 ink += cover(inside.x, dx) * cover(inside.y, dy);
             }
@@ -72,11 +73,22 @@ pub(super) fn line_ink(text: &str, at: Vec2, height: f32, footprint: f32) -> f32
     let ix = (place.x / BOX_DOTS.x) as usize;
     let letter = text.as_bytes().get(ix).map_or(' ', |b| *b as char);
     let in_box = Vec2::new(place.x - ix as f32 * BOX_DOTS.x, place.y);
-    faded(letter_ink(letter, in_box, footprint / dot), letter, dot, footprint)
+    faded(
+        letter_ink(letter, in_box, footprint / dot),
+        letter,
+        dot,
+        footprint,
+    )
 }
 
 /// A column of words that nobody wrote: lines of `line_height`, `half_width` wide, ragged right.
-pub(super) fn column_ink(at: Vec2, half_width: f32, line_height: f32, seed: u32, footprint: f32) -> f32 {
+pub(super) fn column_ink(
+    at: Vec2,
+    half_width: f32,
+    line_height: f32,
+    seed: u32,
+    footprint: f32,
+) -> f32 {
     let dot = line_height / BOX_DOTS.y;
     let row = (at.y / line_height).floor();
     let line = hash(seed ^ (row as i32 as u32));
@@ -92,8 +104,16 @@ pub(super) fn column_ink(at: Vec2, half_width: f32, line_height: f32, seed: u32,
         return 0.0;
     }
     let letter = (b'A' + (id >> 8) as u8 % 26) as char;
-    let in_box = Vec2::new(from_left - column * dot * BOX_DOTS.x, at.y - row * line_height) / dot;
-    faded(letter_ink(letter, in_box, footprint / dot), letter, dot, footprint)
+    let in_box = Vec2::new(
+        from_left - column * dot * BOX_DOTS.x,
+        at.y - row * line_height,
+    ) / dot;
+    faded(
+        letter_ink(letter, in_box, footprint / dot),
+        letter,
+        dot,
+        footprint,
+    )
 }
 
 fn faded(ink: f32, letter: char, dot: f32, footprint: f32) -> f32 {

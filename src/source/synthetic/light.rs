@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::geometry::Ray;
 use super::noise::{fractal, hash, pick};
 use super::scene::{Scene, Solid};
-use super::textures::{Rgb, Spot, mix, rgb};
+use super::textures::{Rgb, mix, rgb};
 
 /// A shining rectangle; it shines to the side of `half_u x half_v`.
 #[derive(Debug, Clone, Copy)]
@@ -27,7 +27,7 @@ pub(super) struct Light {
     pub(super) sun: Option<(DVec3, Rgb)>,
     /// From directions where nothing stands.
     pub(super) sky: Rgb,
-    /// Share of a neighbour's colour that comes back from it.
+    /// What comes back from a neighbour, in shares of its colour.
     pub(super) bounce: Rgb,
     /// Distance at which a neighbour gives half of what a far one gives: how far corners darken.
     pub(super) reach: f64,
@@ -44,7 +44,7 @@ pub(super) struct Grid {
 }
 
 /// Ambient rays per node; a blur over neighbours hides the rest of the noise.
-const N_AMBIENT: u32 = 40;
+const N_AMBIENT: u32 = 32;
 /// Shadow rays per lamp and node, squared.
 const N_SHADOW: u32 = 3;
 const MAX_NODES: f64 = 160.0;
@@ -53,7 +53,11 @@ const RIM: f64 = 0.012;
 
 impl Light {
     pub(super) fn bake(&self, scene: &Scene) -> Vec<Vec<Grid>> {
-        scene.solids.par_iter().map(|solid| self.bake_solid(scene, solid)).collect()
+        scene
+            .solids
+            .par_iter()
+            .map(|solid| self.bake_solid(scene, solid))
+            .collect()
     }
 
     fn bake_solid(&self, scene: &Scene, solid: &Solid) -> Vec<Grid> {
@@ -62,16 +66,20 @@ impl Light {
         }
         let face_grid = |face: u8| {
             let half = solid.placed.face_half(face);
-            let count = |half: f64| ((2.0 * half / self.texel).ceil().clamp(1.0, MAX_NODES)) as usize + 1;
+            let count =
+                |half: f64| ((2.0 * half / self.texel).ceil().clamp(1.0, MAX_NODES)) as usize + 1;
             let (n_u, n_v) = (count(half.x), count(half.y));
             let rim = (DVec2::splat(RIM) / half).min(DVec2::splat(0.3));
             let light = (0..n_u * n_v)
                 .into_par_iter()
                 .map(|ix| {
                     let share = |i: usize, n: usize| 2.0 * i as f64 / (n - 1) as f64 - 1.0;
-                    let scaled = DVec2::new(share(ix % n_u, n_u), share(ix / n_u, n_v)) * (DVec2::ONE - rim);
+                    let scaled =
+                        DVec2::new(share(ix % n_u, n_u), share(ix / n_u, n_v)) * (DVec2::ONE - rim);
                     let (point, normal) = solid.placed.point_on_face(face, scaled);
-                    let seed = hash(solid.seed ^ (ix as u32).wrapping_mul(8).wrapping_add(u32::from(face)));
+                    let seed = hash(
+                        solid.seed ^ (ix as u32).wrapping_mul(8).wrapping_add(u32::from(face)),
+                    );
                     self.gather(scene, point + normal * 1e-3, normal, seed)
                 })
                 .collect();
@@ -95,23 +103,17 @@ impl Light {
             let radius_squared = (f64::from(n) + 0.5) / f64::from(N_AMBIENT);
             let (sin, cos) = (TAU * (start + f64::from(n) * 0.618_033_988_75)).sin_cos();
             let out = radius_squared.sqrt();
-            let direction = (tangent * cos + bitangent * sin) * out + normal * (1.0 - radius_squared).sqrt();
-            let ray = Ray { origin: point, direction };
+            let direction =
+                (tangent * cos + bitangent * sin) * out + normal * (1.0 - radius_squared).sqrt();
+            let ray = Ray {
+                origin: point,
+                direction,
+            };
             sum += match scene.meet(&ray, f64::MAX) {
                 None => self.sky,
                 Some(hit) => {
-                    let solid = &scene.solids[hit.solid_ix];
-                    let at = solid.placed.face_point(point + direction * hit.distance, hit.face);
-                    let spot = Spot {
-                        uv: at.uv.as_vec2(),
-                        half: at.half.as_vec2(),
-                        footprint: 0.5,
-                        face: hit.face,
-                        seed: solid.seed,
-                    };
                     let near = (hit.distance / (hit.distance + self.reach)) as f32;
-                    let colour = solid.paint.colour(&spot).clamp(Vec3::ZERO, Vec3::ONE);
-                    mix(Rgb::splat(0.6), colour, 0.6) * self.bounce * near
+                    scene.solids[hit.solid_ix].mean * self.bounce * near
                 }
             };
         }
@@ -126,8 +128,11 @@ impl Light {
             let facing = across / across.length();
             let mut arriving = 0.0;
             for n in 0..N_SHADOW * N_SHADOW {
-                let jitter = |axis: u32| f64::from(pick(seed, 100 * (lamp_ix as u32 + 1) + 2 * n + axis));
-                let share = |cell: u32, axis: u32| 2.0 * (f64::from(cell) + jitter(axis)) / f64::from(N_SHADOW) - 1.0;
+                let jitter =
+                    |axis: u32| f64::from(pick(seed, 100 * (lamp_ix as u32 + 1) + 2 * n + axis));
+                let share = |cell: u32, axis: u32| {
+                    2.0 * (f64::from(cell) + jitter(axis)) / f64::from(N_SHADOW) - 1.0
+                };
                 let (u, v) = (share(n % N_SHADOW, 0), share(n / N_SHADOW, 1));
                 let on_lamp = lamp.centre + lamp.half_u * u + lamp.half_v * v;
                 let to_lamp = on_lamp - point;
@@ -137,7 +142,13 @@ impl Light {
                 if leaves <= 0.0 || lands <= 0.0 {
                     continue;
                 }
-                if !scene.is_covered(&Ray { origin: point, direction }, distance - 0.02) {
+                if !scene.is_covered(
+                    &Ray {
+                        origin: point,
+                        direction,
+                    },
+                    distance - 0.02,
+                ) {
                     arriving += leaves * lands * area / (distance * distance);
                 }
             }
@@ -147,22 +158,32 @@ impl Light {
     }
 
     pub(super) fn sunlight(&self, scene: &Scene, point: DVec3, normal: DVec3) -> Vec3 {
-        let Some((direction, colour)) = self.sun else { return Vec3::ZERO };
+        let Some((direction, colour)) = self.sun else {
+            return Vec3::ZERO;
+        };
         let lands = normal.dot(direction);
-        if lands <= 0.0 || scene.is_covered(&Ray { origin: point + normal * 1e-3, direction }, f64::MAX) {
+        if lands <= 0.0
+            || scene.is_covered(
+                &Ray {
+                    origin: point + normal * 1e-3,
+                    direction,
+                },
+                f64::MAX,
+            )
+        {
             return Vec3::ZERO;
         }
         colour * lands as f32
     }
+}
 
-    /// Sky with clouds, for rays that meet nothing.
-    pub(super) fn backdrop(&self, direction: DVec3) -> Rgb {
-        let up = direction.z.max(0.02);
-        let on_clouds = Vec2::new((direction.x / up) as f32, (direction.y / up) as f32) * 0.8;
-        let clouds = fractal(on_clouds, 77, 5, 0.02 / up as f32);
-        let blue = mix(rgb(0xC8_DCEC), rgb(0x5A_8CC8), up as f32);
-        mix(blue, rgb(0xF6_F4F0), (0.35 + 1.2 * clouds).clamp(0.0, 1.0))
-    }
+/// Sky with clouds, for rays that meet nothing.
+pub(super) fn backdrop(direction: DVec3) -> Rgb {
+    let up = direction.z.max(0.02);
+    let on_clouds = Vec2::new((direction.x / up) as f32, (direction.y / up) as f32) * 0.8;
+    let clouds = fractal(on_clouds, 77, 5, 0.02 / up as f32);
+    let blue = mix(rgb(0xC8_DCEC), rgb(0x5A_8CC8), up as f32);
+    mix(blue, rgb(0xF6_F4F0), (0.35 + 1.2 * clouds).clamp(0.0, 1.0))
 }
 
 impl Grid {
@@ -175,7 +196,8 @@ impl Grid {
         };
         let (u, share_u) = place(scaled.x, self.n_u);
         let (v, share_v) = place(scaled.y, self.n_v);
-        let row = |v: usize| self.light[v * self.n_u + u].lerp(self.light[v * self.n_u + u + 1], share_u);
+        let row =
+            |v: usize| self.light[v * self.n_u + u].lerp(self.light[v * self.n_u + u + 1], share_u);
         row(v).lerp(row(v + 1), share_v)
     }
 

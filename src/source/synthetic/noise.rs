@@ -84,17 +84,28 @@ pub(super) struct Nearest {
 
 pub(super) fn nearest_point(p: Vec2, seed: u32) -> Nearest {
     let base = p.floor().as_ivec2();
-    let mut best = Nearest { id: 0, distance: f32::MAX, border: 0.0, offset: Vec2::ZERO };
+    let mut best = Nearest {
+        id: 0,
+        distance: f32::MAX,
+        border: 0.0,
+        offset: Vec2::ZERO,
+    };
     let mut second = f32::MAX;
     for dy in -1..=1 {
         for dx in -1..=1 {
             let cell = base + IVec2::new(dx, dy);
             let id = hash2(cell, seed);
-            let point = cell.as_vec2() + Vec2::new(0.1 + 0.8 * pick(id, 1), 0.1 + 0.8 * pick(id, 2));
+            let point =
+                cell.as_vec2() + Vec2::new(0.1 + 0.8 * pick(id, 1), 0.1 + 0.8 * pick(id, 2));
             let distance = p.distance(point);
             if distance < best.distance {
                 second = best.distance;
-                best = Nearest { id, distance, border: 0.0, offset: p - point };
+                best = Nearest {
+                    id,
+                    distance,
+                    border: 0.0,
+                    offset: p - point,
+                };
             } else {
                 second = second.min(distance);
             }
@@ -117,7 +128,10 @@ mod tests {
             assert!((value - value_noise(p + 1e-3, 5)).abs() < 0.02);
             seen = (seen.0.min(value), seen.1.max(value));
         }
-        assert!(seen.0 < -0.8 && seen.0 >= -1.0 && seen.1 > 0.8 && seen.1 <= 1.0, "{seen:?}");
+        assert!(
+            seen.0 < -0.8 && seen.0 >= -1.0 && seen.1 > 0.8 && seen.1 <= 1.0,
+            "{seen:?}"
+        );
     }
 
     #[test]

@@ -17,7 +17,8 @@ use serde::Serialize;
 use crate::camera::{Distortion, Lens};
 use crate::frame::DepthMap;
 use crate::ros::{
-    self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped, TfMessage, TransformStamped,
+    self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped, TfMessage,
+    TransformStamped,
 };
 
 use super::take::Take;
@@ -44,7 +45,9 @@ pub fn write_recording(settings: &SynthSettings, out: &Path) -> Result<SynthSumm
 
 /// The same; `on_frame` hears the number of frames done after each one.
 pub fn write_recording_with(
-    settings: &SynthSettings, out: &Path, mut on_frame: impl FnMut(u32),
+    settings: &SynthSettings,
+    out: &Path,
+    mut on_frame: impl FnMut(u32),
 ) -> Result<SynthSummary, SynthError> {
     let take = Take::new(settings.clone())?;
     let part = with_suffix(out, "part");
@@ -54,18 +57,30 @@ pub fn write_recording_with(
         Err(reason) => {
             // The half file is of no use; that it cannot be removed either says nothing new.
             fs::remove_file(&part).ok();
-            return Err(SynthError::Write { what: "write", reason, path: out.to_owned() });
+            return Err(SynthError::Write {
+                what: "write",
+                reason,
+                path: out.to_owned(),
+            });
         }
     };
     let failed = |what: &'static str, path: &Path| {
         let path = path.to_owned();
-        move |e: std::io::Error| SynthError::Write { what, reason: e.to_string(), path }
+        move |e: std::io::Error| SynthError::Write {
+            what,
+            reason: e.to_string(),
+            path,
+        }
     };
     fs::rename(&part, out).map_err(failed("rename", out))?;
     let tum = out.with_extension("tum");
     fs::write(&tum, tum_lines(&take)).map_err(failed("write the poses beside", &tum))?;
     let bytes = fs::metadata(out).map_err(failed("read back", out))?.len();
-    Ok(SynthSummary { n_frames: settings.n_frames, n_messages, bytes })
+    Ok(SynthSummary {
+        n_frames: settings.n_frames,
+        n_messages,
+        bytes,
+    })
 }
 
 /// The exact trajectory as TUM lines, camera to world: `stamp tx ty tz qx qy qz qw`.
@@ -74,7 +89,9 @@ pub fn truth_tum(settings: &SynthSettings) -> Result<String, SynthError> {
 }
 
 fn tum_lines(take: &Take) -> String {
-    let mut lines = String::from("# timestamp tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)\n");
+    let mut lines = String::from(
+        "# timestamp tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)\n",
+    );
     for ix in 0..take.settings().n_frames {
         let pose = take.pose(ix);
         let (t, q) = (pose.translation, pose.rotation);
@@ -110,14 +127,27 @@ struct Recorder<W: Write + Seek> {
 
 impl<W: Write + Seek> Recorder<W> {
     fn topic<T: Message>(&mut self, name: &str) -> Result<Topic, String> {
-        let schema = self.file.add_schema(T::TYPE_NAME, "ros2msg", T::DEFINITION.as_bytes());
+        let schema = self
+            .file
+            .add_schema(T::TYPE_NAME, "ros2msg", T::DEFINITION.as_bytes());
         let schema = schema.map_err(|e| e.to_string())?;
         let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), String::new())]);
-        let channel_id = self.file.add_channel(schema, name, "cdr", &metadata).map_err(|e| e.to_string())?;
-        Ok(Topic { channel_id, sequence: 0 })
+        let channel_id = self
+            .file
+            .add_channel(schema, name, "cdr", &metadata)
+            .map_err(|e| e.to_string())?;
+        Ok(Topic {
+            channel_id,
+            sequence: 0,
+        })
     }
 
-    fn write<T: Message + Serialize>(&mut self, topic: &mut Topic, nanos: u64, message: &T) -> Result<(), String> {
+    fn write<T: Message + Serialize>(
+        &mut self,
+        topic: &mut Topic,
+        nanos: u64,
+        message: &T,
+    ) -> Result<(), String> {
         let payload = ros::encode(message).map_err(|e| e.to_string())?;
         let header = MessageHeader {
             channel_id: topic.channel_id,
@@ -127,7 +157,9 @@ impl<W: Write + Seek> Recorder<W> {
         };
         topic.sequence += 1;
         self.n_messages += 1;
-        self.file.write_to_known_channel(&header, &payload).map_err(|e| e.to_string())
+        self.file
+            .write_to_known_channel(&header, &payload)
+            .map_err(|e| e.to_string())
     }
 }
 
@@ -139,26 +171,62 @@ fn record(take: &Take, path: &Path, on_frame: &mut impl FnMut(u32)) -> Result<u6
         .compression(Some(mcap::Compression::Zstd))
         // One thread: the bytes must not depend on the machine.
         .compression_threads(0);
-    let mut out = Recorder { file: options.create(file).map_err(|e| e.to_string())?, n_messages: 0 };
+    let mut out = Recorder {
+        file: options.create(file).map_err(|e| e.to_string())?,
+        n_messages: 0,
+    };
     let mut pictures = out.topic::<CompressedImage>("/camera/image_raw/compressed")?;
     let mut calibration = out.topic::<CameraInfo>("/camera/camera_info")?;
     let mut tf = out.topic::<TfMessage>("/tf")?;
     let mut poses = out.topic::<PoseStamped>("/ground_truth/pose")?;
-    let mut depths = if take.settings().depth { Some(out.topic::<Image>("/camera/depth")?) } else { None };
+    let mut depths = if take.settings().depth {
+        Some(out.topic::<Image>("/camera/depth")?)
+    } else {
+        None
+    };
     let lens = take.settings().lens();
     for ix in 0..take.settings().n_frames {
         let stamp = take.stamp(ix);
-        let nanos = u64::try_from(stamp.nanos).map_err(|_| format!("stamp {stamp} lies before the epoch"))?;
-        let header = |frame_id: &str| Header { stamp: stamp.into(), frame_id: frame_id.to_owned() };
+        let nanos = u64::try_from(stamp.nanos)
+            .map_err(|e| format!("stamp {stamp} lies before the epoch: {e}"))?;
+        let header = |frame_id: &str| Header {
+            stamp: stamp.into(),
+            frame_id: frame_id.to_owned(),
+        };
         let pose = take.pose(ix).into();
         out.write(&mut calibration, nanos, &camera_info(&lens, header(CAMERA)))?;
-        let transform = TransformStamped { header: header(WORLD), child_frame_id: CAMERA.to_owned(), transform: pose };
-        out.write(&mut tf, nanos, &TfMessage { transforms: vec![transform] })?;
-        out.write(&mut poses, nanos, &PoseStamped { header: header(WORLD), pose })?;
+        let transform = TransformStamped {
+            header: header(WORLD),
+            child_frame_id: CAMERA.to_owned(),
+            transform: pose,
+        };
+        out.write(
+            &mut tf,
+            nanos,
+            &TfMessage {
+                transforms: vec![transform],
+            },
+        )?;
+        out.write(
+            &mut poses,
+            nanos,
+            &PoseStamped {
+                header: header(WORLD),
+                pose,
+            },
+        )?;
         if let Some(depths) = &mut depths {
-            out.write(depths, nanos, &depth_image(&small_depth(take, ix, &lens), header(CAMERA)))?;
+            out.write(
+                depths,
+                nanos,
+                &depth_image(&small_depth(take, ix, &lens), header(CAMERA)),
+            )?;
         }
-        let picture = CompressedImage { header: header(CAMERA), format: "jpeg".to_owned(), data: jpeg(take, ix)? };
+        let picture = CompressedImage {
+            header: header(CAMERA),
+            format: "jpeg".to_owned(),
+            data: jpeg(take, ix)?,
+        };
         out.write(&mut pictures, nanos, &picture)?;
         on_frame(ix + 1);
     }
@@ -174,15 +242,29 @@ fn jpeg(take: &Take, ix: u32) -> Result<Vec<u8>, String> {
     let picture = take.picture(ix);
     let mut data = Vec::new();
     JpegEncoder::new_with_quality(&mut data, take.settings().jpeg_quality)
-        .encode(&picture.pixels, picture.width_px, picture.height_px, ExtendedColorType::Rgb8)
+        .encode(
+            &picture.pixels,
+            picture.width_px,
+            picture.height_px,
+            ExtendedColorType::Rgb8,
+        )
         .map_err(|e| e.to_string())?;
     Ok(data)
 }
 
 fn small_depth(take: &Take, ix: u32, lens: &Lens) -> DepthMap {
     let (width, height) = (lens.intrinsics.width_px, lens.intrinsics.height_px);
-    let intrinsics = lens.intrinsics.resized(width.div_ceil(DEPTH_DIVISOR), height.div_ceil(DEPTH_DIVISOR));
-    take.depth_through(ix, &Lens { intrinsics, distortion: lens.distortion })
+    let intrinsics = lens.intrinsics.resized(
+        width.div_ceil(DEPTH_DIVISOR),
+        height.div_ceil(DEPTH_DIVISOR),
+    );
+    take.depth_through(
+        ix,
+        &Lens {
+            intrinsics,
+            distortion: lens.distortion,
+        },
+    )
 }
 
 /// Millimetres in 16 bits, as depth cameras send them; 0 where nothing is, or nothing within 65 m.
@@ -198,7 +280,11 @@ fn depth_image(map: &DepthMap, header: Header) -> Image {
         encoding: "16UC1".to_owned(),
         is_bigendian: 0,
         step: 2 * map.width_px,
-        data: map.depth.iter().flat_map(|depth| millimetres(depth).to_le_bytes()).collect(),
+        data: map
+            .depth
+            .iter()
+            .flat_map(|depth| millimetres(depth).to_le_bytes())
+            .collect(),
     }
 }
 

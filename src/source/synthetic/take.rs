@@ -5,7 +5,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use glam::{DVec2, DVec3, Vec3};
+use glam::{DVec2, Vec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use rayon::prelude::*;
@@ -17,14 +17,19 @@ use crate::pose::Rigid;
 
 use super::geometry::Ray;
 use super::scene::Scene;
-use super::{SceneKind, SynthError, SynthSettings, corridor, facade, lens, noise, room, trajectory};
+use super::{SceneKind, SynthError, SynthSettings, corridor, facade, noise, room, trajectory};
 
 /// Header stamps start here and go on at 10 Hz.
 const START_SECS: i64 = 1_700_000_000;
 const FRAME_NANOS: i64 = 100_000_000;
 
 /// Samples of a still picture: a square turned so that no two share a row or column.
-const STILL: [[f64; 2]; 4] = [[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]];
+const STILL: [[f64; 2]; 4] = [
+    [0.125, 0.625],
+    [0.375, 0.125],
+    [0.625, 0.875],
+    [0.875, 0.375],
+];
 /// Samples along a motion streak; streaks are up to some 15 px long.
 const N_BLURRED: usize = 12;
 
@@ -70,25 +75,40 @@ impl Take {
 
     pub fn picture(&self, ix: u32) -> RgbImage {
         let lens = self.settings.lens();
-        let (width, height) = (self.settings.width_px as usize, self.settings.height_px as usize);
+        let (width, height) = (
+            self.settings.width_px as usize,
+            self.settings.height_px as usize,
+        );
         let samples = self.samples(ix);
         let gain = self.gain(ix);
         let mut pixels = vec![0u8; 3 * width * height];
-        pixels.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
-            let mut random = Pcg32::seed_from_u64(
-                self.settings.seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (u64::from(ix) << 20) ^ y as u64,
-            );
-            for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                let light = self.pixel_light(&lens, &samples, [x, y]);
-                *pixel = expose(light * gain, self.settings.noise as f32, &mut random);
-            }
-        });
-        RgbImage { width_px: self.settings.width_px, height_px: self.settings.height_px, pixels }
+        pixels
+            .par_chunks_mut(3 * width)
+            .enumerate()
+            .for_each(|(y, row)| {
+                let mut random = Pcg32::seed_from_u64(
+                    self.settings.seed.wrapping_mul(0x9E37_79B9_7F4A_7C15)
+                        ^ (u64::from(ix) << 20)
+                        ^ y as u64,
+                );
+                for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                    let light = self.pixel_light(&lens, &samples, [x, y]);
+                    *pixel = expose(light * gain, self.settings.noise as f32, &mut random);
+                }
+            });
+        RgbImage {
+            width_px: self.settings.width_px,
+            height_px: self.settings.height_px,
+            pixels,
+        }
     }
 
     /// Exact z-depth of the pixel centres of an undistorted camera; 0 where nothing is.
     pub fn depth(&self, ix: u32, intrinsics: &Intrinsics) -> DepthMap {
-        let lens = Lens { intrinsics: *intrinsics, distortion: crate::camera::Distortion::None };
+        let lens = Lens {
+            intrinsics: *intrinsics,
+            distortion: crate::camera::Distortion::None,
+        };
         self.depth_through(ix, &lens)
     }
 
@@ -97,22 +117,47 @@ impl Take {
         let pose = self.pose(ix);
         let (width_px, height_px) = (lens.intrinsics.width_px, lens.intrinsics.height_px);
         let mut depth = vec![0f32; width_px as usize * height_px as usize];
-        depth.par_chunks_mut(width_px.max(1) as usize).enumerate().for_each(|(y, row)| {
-            for (x, value) in row.iter_mut().enumerate() {
-                let in_cam = lens::ray_in_cam(lens, DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
-                let ray = Ray { origin: pose.translation, direction: pose.rotation * in_cam };
-                *value = self.scene.meet(&ray, f64::MAX).map_or(0.0, |hit| (hit.distance * in_cam.z) as f32);
-            }
-        });
-        let confidence = depth.iter().map(|d| f32::from(u8::from(*d > 0.0))).collect();
-        DepthMap { width_px, height_px, depth, confidence }
+        depth
+            .par_chunks_mut(width_px.max(1) as usize)
+            .enumerate()
+            .for_each(|(y, row)| {
+                for (x, value) in row.iter_mut().enumerate() {
+                    let Some(in_cam) = lens.ray_in_cam(DVec2::new(x as f64 + 0.5, y as f64 + 0.5))
+                    else {
+                        continue;
+                    };
+                    let direction = pose.rotation * in_cam;
+                    let ray = Ray {
+                        origin: pose.translation,
+                        direction,
+                    };
+                    // The ray's third coordinate in the camera is 1, so its length counts depth.
+                    *value = self
+                        .scene
+                        .meet(&ray, f64::MAX)
+                        .map_or(0.0, |hit| hit.distance as f32);
+                }
+            });
+        let confidence = depth
+            .iter()
+            .map(|d| f32::from(u8::from(*d > 0.0)))
+            .collect();
+        DepthMap {
+            width_px,
+            height_px,
+            depth,
+            confidence,
+        }
     }
 
     /// Place within the pixel and camera of every sample.
     fn samples(&self, ix: u32) -> Vec<(DVec2, Rigid)> {
         if self.settings.blur <= 0.0 {
             let pose = self.pose(ix);
-            return STILL.iter().map(|place| (DVec2::from_array(*place), pose)).collect();
+            return STILL
+                .iter()
+                .map(|place| (DVec2::from_array(*place), pose))
+                .collect();
         }
         (0..N_BLURRED)
             .map(|n| {
@@ -130,8 +175,15 @@ impl Take {
         let corner = DVec2::new(x as f64, y as f64);
         let mut sum = Vec3::ZERO;
         for (place, pose) in samples {
-            let in_cam: DVec3 = lens::ray_in_cam(lens, corner + *place);
-            let ray = Ray { origin: pose.translation, direction: pose.rotation * in_cam };
+            // Beyond the rim of a fisheye it is dark.
+            let Some(in_cam) = lens.ray_in_cam(corner + *place) else {
+                continue;
+            };
+            let direction = pose.rotation * in_cam.normalize();
+            let ray = Ray {
+                origin: pose.translation,
+                direction,
+            };
             // Sensors clip each sample's highlights before the eye would: bright lamps keep soft rims.
             sum += self.scene.radiance(&ray, pixel_angle).min(Vec3::splat(4.0));
         }
@@ -151,9 +203,21 @@ fn expose(light: Vec3, noise: f32, random: &mut Pcg32) -> [u8; 3] {
     const SHOULDER: f32 = 0.65;
     light.to_array().map(|value| {
         let room = 1.0 - SHOULDER;
-        let bent = if value < SHOULDER { value } else { SHOULDER + room * (1.0 - (-(value - SHOULDER) / room).exp()) };
-        let srgb = if bent <= 0.003_130_8 { 12.92 * bent } else { 1.055 * bent.powf(1.0 / 2.4) - 0.055 };
-        let shift = if noise > 0.0 { noise * gaussian(random) } else { 0.0 };
+        let bent = if value < SHOULDER {
+            value
+        } else {
+            SHOULDER + room * (1.0 - (-(value - SHOULDER) / room).exp())
+        };
+        let srgb = if bent <= 0.003_130_8 {
+            12.92 * bent
+        } else {
+            1.055 * bent.powf(1.0 / 2.4) - 0.055
+        };
+        let shift = if noise > 0.0 {
+            noise * gaussian(random)
+        } else {
+            0.0
+        };
         (255.0 * srgb + shift).round().clamp(0.0, 255.0) as u8
     })
 }
@@ -162,27 +226,4 @@ fn expose(light: Vec3, noise: f32, random: &mut Pcg32) -> [u8; 3] {
 fn gaussian(random: &mut Pcg32) -> f32 {
     let radius = (-2.0 * (1.0 - random.random::<f32>()).ln()).sqrt();
     radius * (std::f32::consts::TAU * random.random::<f32>()).cos()
-}
-
-/// A distorted picture -> the pinhole picture of the same intrinsics, sampled bilinearly.
-pub(super) fn rectified(image: &RgbImage, lens: &Lens) -> RgbImage {
-    let (width, height) = (image.width_px as usize, image.height_px as usize);
-    let mut pixels = vec![0u8; image.pixels.len()];
-    pixels.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
-        for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-            let ray = lens.intrinsics.ray_in_cam(DVec2::new(x as f64 + 0.5, y as f64 + 0.5));
-            let Some(place) = lens::project(lens, ray) else { continue };
-            let place = (place - 0.5).clamp(DVec2::ZERO, DVec2::new(width as f64 - 1.0, height as f64 - 1.0));
-            let (left, top) = (place.x as usize, place.y as usize);
-            let (right, bottom) = ((left + 1).min(width - 1), (top + 1).min(height - 1));
-            let (u, v) = (place.x.fract(), place.y.fract());
-            for (channel, value) in pixel.iter_mut().enumerate() {
-                let at = |x: usize, y: usize| f64::from(image.pixels[3 * (y * width + x) + channel]);
-                let above = at(left, top) * (1.0 - u) + at(right, top) * u;
-                let below = at(left, bottom) * (1.0 - u) + at(right, bottom) * u;
-                *value = (above * (1.0 - v) + below * v).round() as u8;
-            }
-        }
-    });
-    RgbImage { width_px: image.width_px, height_px: image.height_px, pixels }
 }

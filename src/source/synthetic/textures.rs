@@ -1,12 +1,13 @@
 //! Paint: (place on a face) -> linear colour. Everything is made up from hashes, nothing is stored.
 //!
 //! Each face gets its own seed, so that no two surfaces look the same. Materials of building parts are in
-//! `surfaces.rs`, woven and grown things in `ornaments.rs`, pictures and writing in `pictures.rs`.
+//! `surfaces.rs` and `joinery.rs`, woven and grown things in `ornaments.rs`, pictures and writing in `pictures.rs` and
+//! `prints.rs`.
 
 use glam::{Vec2, Vec3};
 
-use super::noise::{fractal, nearest_point, pick, unit, hash};
-use super::{ornaments, pictures, surfaces};
+use super::noise::{fractal, hash, nearest_point, pick, unit};
+use super::{joinery, ornaments, pictures, prints, surfaces};
 
 /// Linear colour; 1 is white paper.
 pub(super) type Rgb = Vec3;
@@ -29,35 +30,72 @@ pub(super) enum Paint {
     Flat(Rgb),
     Plaster(Rgb),
     /// Running bond: brick colour, mortar colour, size of one brick.
-    Bricks { brick: Rgb, mortar: Rgb, size: Vec2 },
+    Bricks {
+        brick: Rgb,
+        mortar: Rgb,
+        size: Vec2,
+    },
     /// Boards along u: two colours between which they vary, length and width.
-    Planks { light: Rgb, dark: Rgb, size: Vec2 },
+    Planks {
+        light: Rgb,
+        dark: Rgb,
+        size: Vec2,
+    },
     /// Squares of strips that lie crosswise.
-    Parquet { light: Rgb, dark: Rgb },
+    Parquet {
+        light: Rgb,
+        dark: Rgb,
+    },
     /// Square tiles in two colours.
-    Tiles { first: Rgb, second: Rgb, size: f32 },
+    Tiles {
+        first: Rgb,
+        second: Rgb,
+        size: f32,
+    },
     /// Stone chips of many colours in a ground.
-    Terrazzo { ground: Rgb, size: f32 },
+    Terrazzo {
+        ground: Rgb,
+        size: f32,
+    },
     Wood(Rgb),
     Metal(Rgb),
     Asphalt,
     Ceiling,
     Bark,
-    Wallpaper { ground: Rgb, first: Rgb, second: Rgb },
-    Fabric { first: Rgb, second: Rgb, width: f32 },
-    Rug { first: Rgb, second: Rgb },
+    Wallpaper {
+        ground: Rgb,
+        first: Rgb,
+        second: Rgb,
+    },
+    Fabric {
+        first: Rgb,
+        second: Rgb,
+        width: f32,
+    },
+    Rug {
+        first: Rgb,
+        second: Rgb,
+    },
     Leaf(Rgb),
     Fruit(Rgb),
     Picture(Picture),
     Spine(Rgb),
-    Label { ground: Rgb, ink: Rgb, text: &'static str },
+    Label {
+        ground: Rgb,
+        ink: Rgb,
+        text: &'static str,
+    },
     /// A window seen from outside.
     Pane,
     /// Shines by itself: colour and strength.
     Glow(Rgb),
     /// A window seen from inside: the bright world behind the glass.
     View,
-    Drawers { wood: Rgb, rows: u8, columns: u8 },
+    Drawers {
+        wood: Rgb,
+        rows: u8,
+        columns: u8,
+    },
     Panelled(Rgb),
 }
 
@@ -81,29 +119,49 @@ impl Paint {
         match *self {
             Self::Flat(colour) => flat(colour, spot),
             Self::Plaster(colour) => surfaces::plaster(colour, spot),
-            Self::Bricks { brick, mortar, size } => surfaces::bricks(brick, mortar, size, spot),
-            Self::Planks { light, dark, size } => surfaces::planks(light, dark, size, spot),
-            Self::Parquet { light, dark } => surfaces::parquet(light, dark, spot),
-            Self::Tiles { first, second, size } => surfaces::tiles(first, second, size, spot),
+            Self::Bricks {
+                brick,
+                mortar,
+                size,
+            } => surfaces::bricks(brick, mortar, size, spot),
+            Self::Planks { light, dark, size } => joinery::planks(light, dark, size, spot),
+            Self::Parquet { light, dark } => joinery::parquet(light, dark, spot),
+            Self::Tiles {
+                first,
+                second,
+                size,
+            } => surfaces::tiles(first, second, size, spot),
             Self::Terrazzo { ground, size } => surfaces::terrazzo(ground, size, spot),
-            Self::Wood(colour) => surfaces::wood(colour, spot.uv, spot),
+            Self::Wood(colour) => joinery::wood(colour, spot.uv, spot),
             Self::Metal(colour) => surfaces::metal(colour, spot),
             Self::Asphalt => surfaces::asphalt(spot),
             Self::Ceiling => surfaces::ceiling(spot),
             Self::Bark => surfaces::bark(spot),
-            Self::Wallpaper { ground, first, second } => ornaments::wallpaper([ground, first, second], spot),
-            Self::Fabric { first, second, width } => ornaments::fabric(first, second, width, spot),
+            Self::Wallpaper {
+                ground,
+                first,
+                second,
+            } => ornaments::wallpaper([ground, first, second], spot),
+            Self::Fabric {
+                first,
+                second,
+                width,
+            } => ornaments::fabric(first, second, width, spot),
             Self::Rug { first, second } => ornaments::rug(first, second, spot),
             Self::Leaf(colour) => ornaments::leaf(colour, spot),
             Self::Fruit(colour) => ornaments::fruit(colour, spot),
             Self::Picture(picture) => pictures::picture(picture, spot),
-            Self::Spine(colour) => pictures::spine(colour, spot),
-            Self::Label { ground, ink, text } => pictures::label(ground, ink, text, spot),
+            Self::Spine(colour) => prints::spine(colour, spot),
+            Self::Label { ground, ink, text } => prints::label(ground, ink, text, spot),
             Self::Pane => surfaces::pane(spot),
             Self::Glow(colour) => colour,
             Self::View => pictures::view(spot),
-            Self::Drawers { wood, rows, columns } => surfaces::drawers(wood, rows, columns, spot),
-            Self::Panelled(colour) => surfaces::panelled(colour, spot),
+            Self::Drawers {
+                wood,
+                rows,
+                columns,
+            } => joinery::drawers(wood, rows, columns, spot),
+            Self::Panelled(colour) => joinery::panelled(colour, spot),
         }
     }
 
@@ -117,7 +175,11 @@ impl Paint {
 pub(super) fn rgb(hex: u32) -> Rgb {
     let channel = |shift: u32| {
         let value = ((hex >> shift) & 255) as f32 / 255.0;
-        if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+        if value <= 0.04045 {
+            value / 12.92
+        } else {
+            ((value + 0.055) / 1.055).powf(2.4)
+        }
     };
     Vec3::new(channel(16), channel(8), channel(0))
 }
@@ -135,8 +197,8 @@ pub(super) fn hue(hue: f32, saturation: f32, value: f32) -> Rgb {
 /// A palette of printed and dyed things: warm and cool, light and dark.
 pub(super) fn palette(n: u32) -> Rgb {
     const COLOURS: [u32; 16] = [
-        0xB5_3A2E, 0x1F_4E79, 0xE0_A030, 0x2F_6B4F, 0xEB_E3D0, 0x6A_3552, 0xD9_7B4A, 0x24_2B38, 0x8F_B3C4, 0xC4_3F6B,
-        0x5E_7A32, 0xF2_D25C, 0x38_8087, 0x8A_5A3C, 0xD8_D3E0, 0x44_4F9C,
+        0xB5_3A2E, 0x1F_4E79, 0xE0_A030, 0x2F_6B4F, 0xEB_E3D0, 0x6A_3552, 0xD9_7B4A, 0x24_2B38,
+        0x8F_B3C4, 0xC4_3F6B, 0x5E_7A32, 0xF2_D25C, 0x38_8087, 0x8A_5A3C, 0xD8_D3E0, 0x44_4F9C,
     ];
     rgb(COLOURS[(n % 16) as usize])
 }

@@ -20,23 +20,45 @@ pub(super) fn world_from_cam(scene: SceneKind, secs: f64, seed: u32) -> Rigid {
         SceneKind::Corridor => through_the_corridor(turn),
     };
     let rotation = looking(target - position) * DQuat::from_scaled_axis(shake(secs, seed, 0.008));
-    Rigid::new(rotation, position + shake(secs, seed ^ 0x51ED, 0.012) + step_bob(secs))
+    Rigid::new(
+        rotation,
+        position + shake(secs, seed ^ 0x51ED, 0.012) + step_bob(secs),
+    )
 }
 
 /// To and fro on an arc round the table; higher and wider on the way out than on the way back.
 fn around_the_table(turn: f64) -> (DVec3, DVec3) {
-    let angle = (-95.0 - 105.0 * turn.cos()).to_radians();
+    let angle = (-95.0 - 82.0 * turn.cos()).to_radians();
     let wide = 1.0 + 0.07 * turn.sin();
-    let position = DVec3::new(2.05 * wide * angle.cos(), 1.62 * wide * angle.sin(), 1.5 + 0.16 * turn.sin());
+    let position = DVec3::new(
+        2.05 * wide * angle.cos(),
+        1.62 * wide * angle.sin(),
+        1.5 + 0.16 * turn.sin(),
+    );
     let glance = 0.35 * (2.0 * turn).sin();
-    let target = DVec3::new(-0.35 * position.x, -0.35 * position.y, 1.02 + 0.12 * (3.0 * turn).sin());
-    (position, target + DVec3::new(-angle.sin(), angle.cos(), 0.0) * glance)
+    let target = DVec3::new(
+        -0.35 * position.x,
+        -0.35 * position.y,
+        1.02 + 0.12 * (3.0 * turn).sin(),
+    );
+    (
+        position,
+        target + DVec3::new(-angle.sin(), angle.cos(), 0.0) * glance,
+    )
 }
 
 /// Sideways before the house and back, nearer on the way back.
 fn along_the_street(turn: f64) -> (DVec3, DVec3) {
-    let position = DVec3::new(-4.2 * turn.cos(), -6.6 + 0.7 * turn.sin(), 1.6 + 0.1 * turn.sin());
-    let target = DVec3::new(0.8 * position.x + 0.9 * (2.0 * turn).sin(), 0.0, 2.9 + 0.4 * turn.sin());
+    let position = DVec3::new(
+        -4.4 * turn.cos(),
+        -7.8 + 0.8 * turn.sin(),
+        1.65 + 0.1 * turn.sin(),
+    );
+    let target = DVec3::new(
+        0.8 * position.x + 0.9 * (2.0 * turn).sin(),
+        0.0,
+        2.45 + 0.4 * turn.sin(),
+    );
     (position, target)
 }
 
@@ -45,12 +67,12 @@ fn through_the_corridor(turn: f64) -> (DVec3, DVec3) {
     let place = |turn: f64| {
         // A squircle keeps to the middle of four straight corridors and rounds their corners.
         let (sin, cos) = turn.sin_cos();
-        let round = (cos.powi(6) + sin.powi(6)).powf(-1.0 / 6.0);
+        let round = (cos.powi(4) + sin.powi(4)).powf(-0.25);
         DVec3::new(2.75 * cos * round, 2.25 * sin * round, 1.55)
     };
-    let side = 0.35 * (5.0 * turn).sin();
+    let side = 0.3 * (3.0 * turn).sin();
     let position = place(turn);
-    let ahead = place(turn + 0.28) - position;
+    let ahead = place(turn + 0.45) - position;
     let across = DVec3::new(-ahead.y, ahead.x, 0.0);
     (position, position + ahead + across * side - DVec3::Z * 0.1)
 }

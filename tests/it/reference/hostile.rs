@@ -19,8 +19,8 @@ const PLAIN: Recipe = Recipe {
 /// All kinds of scenes: what makes it special, how many of it, how it is made from a seed.
 pub type Kind = (&'static str, u64, fn(u64) -> Scene);
 
-pub const KINDS: [Kind; 18] = [
-    ("plain", 50, |seed| {
+pub const KINDS: [Kind; 19] = [
+    ("plain", 44, |seed| {
         random::scene(
             seed,
             &Recipe {
@@ -64,6 +64,7 @@ pub const KINDS: [Kind; 18] = [
     ("not a number", 12, not_a_number),
     ("zero quaternions", 8, zero_quaternions),
     ("extreme opacities", 10, extreme_opacities),
+    ("absurd colours", 6, absurd_colours),
     ("no splats", 3, |seed| {
         random::scene(
             seed,
@@ -195,6 +196,19 @@ fn extreme_opacities(seed: u64) -> Scene {
         .zip(logits.into_iter().cycle())
     {
         *logit = extreme;
+    }
+    scene
+}
+
+/// Too bright, too dark, and at the end of f32 in a band above 0.
+fn absurd_colours(seed: u64) -> Scene {
+    let mut scene = random::scene(seed, &PLAIN);
+    let stride = scene.splats.sh_stride();
+    for (ix, (coefficient, value)) in [(0, 6e4), (0, -6e4), (2, 1e20), (6, f32::MAX), (0, 5.0)]
+        .into_iter()
+        .enumerate()
+    {
+        scene.splats.sh[3 * ix * stride + 3 * coefficient] = value;
     }
     scene
 }
