@@ -248,7 +248,8 @@ mod tests {
     /// Soft spots on grey: (x, y, sigma, height) each, coordinates with pixel centres at +0.5.
     fn spots(width: usize, height: usize, spots: &[(f32, f32, f32, f32)]) -> Grey {
         let value = |x: f32, y: f32| {
-            let one = |s: &(f32, f32, f32, f32)| s.3 * (-((x - s.0).powi(2) + (y - s.1).powi(2)) / (2.0 * s.2 * s.2)).exp();
+            let one =
+                |s: &(f32, f32, f32, f32)| s.3 * (-((x - s.0).powi(2) + (y - s.1).powi(2)) / (2.0 * s.2 * s.2)).exp();
             0.5 + spots.iter().map(one).sum::<f32>()
         };
         let pixels = (0..width * height).map(|i| value((i % width) as f32 + 0.5, (i / width) as f32 + 0.5)).collect();

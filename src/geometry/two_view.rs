@@ -341,7 +341,12 @@ mod tests {
         let along = found.second_from_first.translation.dot(pose.translation.normalize());
         assert!(found.second_from_first.angle_to(&pose).to_degrees() < 0.15);
         assert!(along > 0.3_f64.to_radians().cos() - 1e-3, "{along}");
-        assert!(found.inliers.len() >= 150 && found.parallax_deg > 5.0, "{} {}", found.inliers.len(), found.parallax_deg);
+        assert!(
+            found.inliers.len() >= 150 && found.parallax_deg > 5.0,
+            "{} {}",
+            found.inliers.len(),
+            found.parallax_deg
+        );
     }
 
     #[test]
