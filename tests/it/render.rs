@@ -5,6 +5,7 @@ use splat_mapper::splat::Rendering;
 use crate::backends::BACKENDS;
 use crate::reference::hostile::{KINDS, camera};
 use crate::reference::random::Scene;
+use crate::reference::raster::Raster;
 use crate::reference::{Params, doubt, render};
 
 /// Half a step of an 8-bit picture: nobody sees less.
@@ -65,9 +66,9 @@ fn compare(scene: &Scene, rendering: &Rendering, max_error: f64) -> Result<Tally
     };
     for (pixel, doubt) in doubts.iter().enumerate() {
         let mut errors = [(0.0, 0.0); 5];
-        for channel in 0..3 {
+        for (channel, error) in errors[..3].iter_mut().enumerate() {
             let at = 3 * pixel + channel;
-            errors[channel] = (
+            *error = (
                 (f64::from(rendering.rgb[at]) - twin.rgb[at]).abs(),
                 doubt.rgb[channel],
             );
@@ -133,7 +134,10 @@ fn check(max_error: f64, mut backend: impl FnMut(&Scene) -> Rendering) -> Result
 
 /// The twin itself, rounded to f32: the best that a backend can be.
 fn rounded_twin(scene: &Scene) -> Rendering {
-    let raster = render(&Params::from(&scene.splats), &camera(scene), 3);
+    rounded(&render(&Params::from(&scene.splats), &camera(scene), 3))
+}
+
+fn rounded(raster: &Raster) -> Rendering {
     Rendering {
         width_px: raster.width_px as u32,
         height_px: raster.height_px as u32,
@@ -159,6 +163,38 @@ fn every_backends_pictures_are_the_twins() {
 fn few_pixels_hang_on_a_decision_that_rounding_may_turn() {
     check(1e-6, rounded_twin).unwrap();
     assert_eq!(KINDS.iter().map(|kind| kind.1).sum::<u64>(), 200);
+}
+
+/// Every parameter off by up to half a rounding of f32, equal ones by equal amounts, otherwise exact.
+fn shaken_twin(scene: &Scene) -> Rendering {
+    let mut params = Params::from(&scene.splats);
+    let means = params.means.as_flattened_mut().iter_mut();
+    let shapes = params
+        .log_scales
+        .as_flattened_mut()
+        .iter_mut()
+        .chain(params.quats.as_flattened_mut());
+    for value in means.chain(shapes).filter(|value| value.is_finite()) {
+        *value *= 1.0 + 6e-8 * (*value * 1e7).sin();
+    }
+    rounded(&render(&params, &camera(scene), 3))
+}
+
+#[test]
+fn rounding_of_the_parameters_stays_within_the_doubt_and_needs_it() {
+    check(MAX_ERROR, shaken_twin).unwrap();
+    let needs_it = KINDS
+        .into_iter()
+        .flat_map(|(_, n, make)| (0..n).map(make))
+        .any(|scene| {
+            let (exact, shaken) = (rounded_twin(&scene), shaken_twin(&scene));
+            exact
+                .rgb
+                .iter()
+                .zip(&shaken.rgb)
+                .any(|(a, b)| f64::from((a - b).abs()) > MAX_ERROR)
+        });
+    assert!(needs_it);
 }
 
 #[test]
