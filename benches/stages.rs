@@ -71,20 +71,20 @@ fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingVie
         group.finish();
     };
     bench("project", &mut || {
-        project::project(black_box(splats), &camera, 3, &mut projected)
+        project::project(black_box(splats), &camera, 3, &mut projected);
     });
     let visible = &projected.splats;
     bench("bin", &mut || {
-        bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles)
+        bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles);
     });
     bench("raster", &mut || {
-        raster::raster(visible, &tiles, &mut picture)
+        raster::raster(visible, &tiles, &mut picture);
     });
     bench("loss", &mut || {
         black_box(loss::loss(&picture, &target, &settings, &mut pixels));
     });
     bench("raster_backward", &mut || {
-        raster_backward(visible, &tiles, &picture, &pixels, &mut instances)
+        raster_backward(visible, &tiles, &picture, &pixels, &mut instances);
     });
     let forward = Forward {
         splats,
@@ -93,7 +93,7 @@ fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingVie
         tiles: &tiles,
     };
     bench("project_backward", &mut || {
-        project_backward(forward, &instances, &settings, &mut gradients)
+        project_backward(forward, &instances, &settings, &mut gradients);
     });
     #[expect(clippy::print_stderr, reason = "says what was measured")]
     {

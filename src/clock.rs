@@ -15,7 +15,9 @@ impl Stamp {
 
     /// Seconds are rounded to the nearest nanosecond; a value that does not fit saturates.
     pub fn from_secs(secs: f64) -> Self {
-        Self { nanos: (secs * 1e9).round() as i64 }
+        Self {
+            nanos: (secs * 1e9).round() as i64,
+        }
     }
 
     pub fn secs(self) -> f64 {
@@ -33,7 +35,12 @@ impl std::fmt::Display for Stamp {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sign = if self.nanos < 0 { "-" } else { "" };
         let nanos = self.nanos.unsigned_abs();
-        write!(f, "{sign}{}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000)
+        write!(
+            f,
+            "{sign}{}.{:09}",
+            nanos / 1_000_000_000,
+            nanos % 1_000_000_000
+        )
     }
 }
 
@@ -46,7 +53,9 @@ pub struct Stopwatch {
 impl Stopwatch {
     #[expect(clippy::disallowed_methods, reason = "the one home of Instant::now")]
     pub fn start() -> Self {
-        Self { start: Instant::now() }
+        Self {
+            start: Instant::now(),
+        }
     }
 
     pub fn elapsed(&self) -> Duration {

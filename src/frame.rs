@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
-use crate::clock::Stamp;
+use crate::clock::{Stamp, Stopwatch};
 use crate::pose::Rigid;
 
 /// 8-bit sRGB, rows top to bottom, `pixels.len() == 3 * width_px * height_px`.
@@ -17,6 +17,39 @@ pub struct RgbImage {
 impl std::fmt::Debug for RgbImage {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "RgbImage({}x{})", self.width_px, self.height_px)
+    }
+}
+
+impl RgbImage {
+    /// Scaled down so that the longer side is at most `max_side_px`; a smaller picture is copied.
+    pub fn shrunk(&self, max_side_px: u32) -> Self {
+        let longest = self.width_px.max(self.height_px);
+        if longest <= max_side_px {
+            return self.clone();
+        }
+        let scaled = |side: u32| {
+            let side = f64::from(side) * f64::from(max_side_px) / f64::from(longest);
+            (side.round() as u32).max(1)
+        };
+        self.resized(scaled(self.width_px), scaled(self.height_px))
+    }
+
+    /// Area-averaged to another size, which may change the aspect.
+    pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
+        use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer, images};
+        let source =
+            images::ImageRef::new(self.width_px, self.height_px, &self.pixels, PixelType::U8x3)
+                .expect("three bytes per pixel");
+        let mut target = images::Image::new(width_px, height_px, PixelType::U8x3);
+        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Box));
+        Resizer::new()
+            .resize(&source, &mut target, &options)
+            .expect("both pictures are U8x3");
+        Self {
+            width_px,
+            height_px,
+            pixels: target.into_vec(),
+        }
     }
 }
 
@@ -56,6 +89,8 @@ pub struct Frame {
 pub struct Keyframe {
     pub id: u32,
     pub frame: Frame,
+    /// Runs since the frame was selected: latencies in reports.
+    pub age: Stopwatch,
 }
 
 /// Keyframes for one inference; the first `n_shared` were in the batch before.

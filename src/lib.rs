@@ -5,20 +5,39 @@
 //! `Frame -> Batch -> GeometryBatch -> SplatMap -> Arc<Snapshot> -> publishers`.
 
 pub mod clock;
+
 pub mod config;
+
 pub mod pose;
+
 pub mod camera;
+
 pub mod queue;
+
+pub mod atomic;
+
 pub mod frame;
+
 pub mod ros;
+
 pub mod source;
+
 pub mod select;
+
 pub mod geometry;
+
 pub mod gpu;
+
 pub mod splat;
+
 pub mod map;
+
 pub mod publish;
+
 pub mod export;
+
 pub mod eval;
+
 pub mod node;
+
 pub mod cli;

@@ -20,15 +20,24 @@ pub struct Similarity {
 }
 
 impl Rigid {
-    pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
+    pub const IDENTITY: Self = Self {
+        rotation: DQuat::IDENTITY,
+        translation: DVec3::ZERO,
+    };
 
     pub fn new(rotation: DQuat, translation: DVec3) -> Self {
-        Self { rotation, translation }
+        Self {
+            rotation,
+            translation,
+        }
     }
 
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.conjugate();
-        Self { rotation, translation: -(rotation * self.translation) }
+        Self {
+            rotation,
+            translation: -(rotation * self.translation),
+        }
     }
 
     pub fn transform_point(&self, point: DVec3) -> DVec3 {
@@ -44,12 +53,21 @@ impl Rigid {
         let angle = theta.length();
         let skew = skew(theta);
         let (b, c) = if angle < 1e-5 {
-            (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
+            (
+                0.5 - angle * angle / 24.0,
+                1.0 / 6.0 - angle * angle / 120.0,
+            )
         } else {
-            ((1.0 - angle.cos()) / (angle * angle), (angle - angle.sin()) / (angle * angle * angle))
+            (
+                (1.0 - angle.cos()) / (angle * angle),
+                (angle - angle.sin()) / (angle * angle * angle),
+            )
         };
         let v = DMat3::IDENTITY + skew * b + skew * skew * c;
-        Self { rotation: DQuat::from_scaled_axis(theta), translation: v * rho }
+        Self {
+            rotation: DQuat::from_scaled_axis(theta),
+            translation: v * rho,
+        }
     }
 
     /// Angle in radians of the rotation that takes `self` to `other`.
@@ -65,9 +83,21 @@ impl Rigid {
         self.rotation.is_finite() && self.translation.is_finite()
     }
 
+    /// Between `self` (share 0) and `other` (share 1): straight and at even speed, the short way round.
+    pub fn between(&self, other: &Self, share: f64) -> Self {
+        let same_side = if self.rotation.dot(other.rotation) < 0.0 { -other.rotation } else { other.rotation };
+        Self {
+            rotation: self.rotation.slerp(same_side, share),
+            translation: self.translation.lerp(other.translation, share),
+        }
+    }
+
     /// Products of many rotations lose unit length; this restores it.
     pub fn renormalized(&self) -> Self {
-        Self { rotation: self.rotation.normalize(), translation: self.translation }
+        Self {
+            rotation: self.rotation.normalize(),
+            translation: self.translation,
+        }
     }
 }
 
@@ -83,12 +113,20 @@ impl std::ops::Mul for Rigid {
 }
 
 impl Similarity {
-    pub const IDENTITY: Self = Self { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
+    pub const IDENTITY: Self = Self {
+        scale: 1.0,
+        rotation: DQuat::IDENTITY,
+        translation: DVec3::ZERO,
+    };
 
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.conjugate();
         let scale = 1.0 / self.scale;
-        Self { scale, rotation, translation: -(rotation * self.translation) * scale }
+        Self {
+            scale,
+            rotation,
+            translation: -(rotation * self.translation) * scale,
+        }
     }
 
     pub fn transform_point(&self, point: DVec3) -> DVec3 {

@@ -33,7 +33,9 @@ struct Shared<T> {
 impl<T> Shared<T> {
     fn lock(&self) -> MutexGuard<'_, State<T>> {
         // A panic while the lock was held cannot leave the deque half changed.
-        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.state
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 }
 
@@ -48,7 +50,11 @@ pub struct Receiver<T> {
 }
 
 /// One sender, one receiver, at most `capacity` items between them.
-pub fn queue<T>(name: &'static str, capacity: usize, when_full: WhenFull) -> (Sender<T>, Receiver<T>) {
+pub fn queue<T>(
+    name: &'static str,
+    capacity: usize,
+    when_full: WhenFull,
+) -> (Sender<T>, Receiver<T>) {
     assert!(capacity > 0, "queue {name} needs room for one item");
     let state = State {
         items: VecDeque::with_capacity(capacity),
@@ -57,8 +63,19 @@ pub fn queue<T>(name: &'static str, capacity: usize, when_full: WhenFull) -> (Se
         dropped: 0,
         sent: 0,
     };
-    let shared = Arc::new(Shared { name, capacity, when_full, state: Mutex::new(state), changed: Condvar::new() });
-    (Sender { shared: Arc::clone(&shared) }, Receiver { shared })
+    let shared = Arc::new(Shared {
+        name,
+        capacity,
+        when_full,
+        state: Mutex::new(state),
+        changed: Condvar::new(),
+    });
+    (
+        Sender {
+            shared: Arc::clone(&shared),
+        },
+        Receiver { shared },
+    )
 }
 
 impl<T> Sender<T> {
@@ -78,7 +95,11 @@ impl<T> Sender<T> {
                     state.dropped += 1;
                 }
                 WhenFull::Wait => {
-                    state = self.shared.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+                    state = self
+                        .shared
+                        .changed
+                        .wait(state)
+                        .unwrap_or_else(std::sync::PoisonError::into_inner);
                 }
             }
         }
@@ -108,7 +129,11 @@ impl<T> Receiver<T> {
             if !state.sender_is_alive {
                 return None;
             }
-            state = self.shared.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
+            state = self
+                .shared
+                .changed
+                .wait(state)
+                .unwrap_or_else(std::sync::PoisonError::into_inner);
         }
     }
 
@@ -120,7 +145,11 @@ impl<T> Receiver<T> {
             self.shared.changed.notify_all();
             return Ok(Some(item));
         }
-        if state.sender_is_alive { Ok(None) } else { Err(Ended) }
+        if state.sender_is_alive {
+            Ok(None)
+        } else {
+            Err(Ended)
+        }
     }
 
     pub fn dropped(&self) -> u64 {

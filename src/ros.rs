@@ -12,12 +12,20 @@ use crate::clock::Stamp;
 pub enum CdrError {
     #[error("message of {found_bytes} bytes is too short for the 4 byte CDR header")]
     TooShort { found_bytes: usize },
-    #[error("CDR representation {found:#06x}, expected plain CDR (0x0000 big or 0x0001 little endian)")]
+    #[error(
+        "CDR representation {found:#06x}, expected plain CDR (0x0000 big or 0x0001 little endian)"
+    )]
     Representation { found: u16 },
     #[error("{type_name} does not decode: {reason}")]
-    Decode { type_name: &'static str, reason: String },
+    Decode {
+        type_name: &'static str,
+        reason: String,
+    },
     #[error("{type_name} does not encode: {reason}")]
-    Encode { type_name: &'static str, reason: String },
+    Encode {
+        type_name: &'static str,
+        reason: String,
+    },
 }
 
 /// A message type: its full ROS name and its definition text in `ros2msg` form.
@@ -31,20 +39,31 @@ pub trait Message {
 /// CDR payload -> message. Extra bytes behind the message are allowed (rosbag2 pads), missing ones are an error.
 pub fn decode<T: Message + DeserializeOwned>(payload: &[u8]) -> Result<T, CdrError> {
     let Some((header, body)) = payload.split_first_chunk::<4>() else {
-        return Err(CdrError::TooShort { found_bytes: payload.len() });
+        return Err(CdrError::TooShort {
+            found_bytes: payload.len(),
+        });
     };
     let message = match u16::from_be_bytes([header[0], header[1]]) {
         0 => cdr_encoding::from_bytes::<T, byteorder::BigEndian>(body),
         1 => cdr_encoding::from_bytes::<T, byteorder::LittleEndian>(body),
         found => return Err(CdrError::Representation { found }),
     };
-    message.map(|(message, _)| message).map_err(|e| CdrError::Decode { type_name: T::TYPE_NAME, reason: e.to_string() })
+    message
+        .map(|(message, _)| message)
+        .map_err(|e| CdrError::Decode {
+            type_name: T::TYPE_NAME,
+            reason: e.to_string(),
+        })
 }
 
 /// Message -> little-endian CDR payload with header.
 pub fn encode<T: Message + Serialize>(message: &T) -> Result<Vec<u8>, CdrError> {
-    let body = cdr_encoding::to_vec::<T, byteorder::LittleEndian>(message)
-        .map_err(|e| CdrError::Encode { type_name: T::TYPE_NAME, reason: e.to_string() })?;
+    let body = cdr_encoding::to_vec::<T, byteorder::LittleEndian>(message).map_err(|e| {
+        CdrError::Encode {
+            type_name: T::TYPE_NAME,
+            reason: e.to_string(),
+        }
+    })?;
     let mut payload = Vec::with_capacity(body.len() + 4);
     payload.extend_from_slice(&[0, 1, 0, 0]);
     payload.extend_from_slice(&body);
@@ -62,7 +81,10 @@ impl From<Stamp> for Time {
     fn from(stamp: Stamp) -> Self {
         let sec = stamp.nanos.div_euclid(1_000_000_000);
         let sec = i32::try_from(sec).unwrap_or(if sec < 0 { i32::MIN } else { i32::MAX });
-        Self { sec, nanosec: stamp.nanos.rem_euclid(1_000_000_000) as u32 }
+        Self {
+            sec,
+            nanosec: stamp.nanos.rem_euclid(1_000_000_000) as u32,
+        }
     }
 }
 
@@ -146,7 +168,12 @@ pub struct Quaternion {
 
 impl Default for Quaternion {
     fn default() -> Self {
-        Self { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }
+        Self {
+            x: 0.0,
+            y: 0.0,
+            z: 0.0,
+            w: 1.0,
+        }
     }
 }
 
@@ -161,8 +188,17 @@ impl From<crate::pose::Rigid> for Pose {
     fn from(rigid: crate::pose::Rigid) -> Self {
         let (t, q) = (rigid.translation, rigid.rotation);
         Self {
-            position: Vector3 { x: t.x, y: t.y, z: t.z },
-            orientation: Quaternion { x: q.x, y: q.y, z: q.z, w: q.w },
+            position: Vector3 {
+                x: t.x,
+                y: t.y,
+                z: t.z,
+            },
+            orientation: Quaternion {
+                x: q.x,
+                y: q.y,
+                z: q.z,
+                w: q.w,
+            },
         }
     }
 }
@@ -200,7 +236,6 @@ pub struct TfMessage {
     pub transforms: Vec<TransformStamped>,
 }
 
-
 macro_rules! separator {
     () => {
         "================================================================================\n"
@@ -208,22 +243,37 @@ macro_rules! separator {
 }
 macro_rules! time_def {
     () => {
-        concat!(separator!(), "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n")
+        concat!(
+            separator!(),
+            "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+        )
     };
 }
 macro_rules! header_def {
     () => {
-        concat!(separator!(), "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n", time_def!())
+        concat!(
+            separator!(),
+            "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
+            time_def!()
+        )
     };
 }
 macro_rules! vector_defs {
     ($name:literal) => {
-        concat!(separator!(), "MSG: geometry_msgs/", $name, "\nfloat64 x\nfloat64 y\nfloat64 z\n")
+        concat!(
+            separator!(),
+            "MSG: geometry_msgs/",
+            $name,
+            "\nfloat64 x\nfloat64 y\nfloat64 z\n"
+        )
     };
 }
 macro_rules! quaternion_def {
     () => {
-        concat!(separator!(), "MSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n")
+        concat!(
+            separator!(),
+            "MSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
+        )
     };
 }
 macro_rules! pose_def {
@@ -252,6 +302,9 @@ macro_rules! transform_defs {
     };
 }
 
+// `publish/wire.rs` completes the definitions of msgs/ with these.
+pub(crate) use {header_def, pose_def, quaternion_def, separator, time_def, vector_defs};
+
 impl Message for Image {
     const TYPE_NAME: &'static str = "sensor_msgs/msg/Image";
     const DEFINITION: &'static str = concat!(
@@ -262,7 +315,10 @@ impl Message for Image {
 
 impl Message for CompressedImage {
     const TYPE_NAME: &'static str = "sensor_msgs/msg/CompressedImage";
-    const DEFINITION: &'static str = concat!("std_msgs/Header header\nstring format\nuint8[] data\n", header_def!());
+    const DEFINITION: &'static str = concat!(
+        "std_msgs/Header header\nstring format\nuint8[] data\n",
+        header_def!()
+    );
 }
 
 impl Message for CameraInfo {
@@ -278,13 +334,17 @@ impl Message for CameraInfo {
 
 impl Message for PoseStamped {
     const TYPE_NAME: &'static str = "geometry_msgs/msg/PoseStamped";
-    const DEFINITION: &'static str =
-        concat!("std_msgs/Header header\nPose pose\n", header_def!(), pose_def!());
+    const DEFINITION: &'static str = concat!(
+        "std_msgs/Header header\nPose pose\n",
+        header_def!(),
+        pose_def!()
+    );
 }
 
 impl Message for TransformStamped {
     const TYPE_NAME: &'static str = "geometry_msgs/msg/TransformStamped";
-    const DEFINITION: &'static str = concat!(transform_stamped_body!(), header_def!(), transform_defs!());
+    const DEFINITION: &'static str =
+        concat!(transform_stamped_body!(), header_def!(), transform_defs!());
 }
 
 impl Message for TfMessage {

@@ -1,5 +1,17 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
+pub mod known;
+pub mod mvs;
+pub mod scale_space;
+pub mod features;
+pub mod matching;
+pub mod triangulate;
+pub mod two_view;
+pub mod pnp;
+pub mod focal;
+pub mod bundle;
+pub mod sfm;
+
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};
 use crate::pose::Rigid;
@@ -44,7 +56,12 @@ pub struct GeometryBatch {
 #[derive(Debug, thiserror::Error)]
 pub enum GeometryError {
     #[error("{model} needs {needs} for keyframe {keyframe_id}, found none; {way_out}")]
-    Missing { model: &'static str, needs: &'static str, keyframe_id: u32, way_out: &'static str },
+    Missing {
+        model: &'static str,
+        needs: &'static str,
+        keyframe_id: u32,
+        way_out: &'static str,
+    },
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
 }

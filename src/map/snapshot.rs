@@ -17,6 +17,20 @@ pub enum ScaleSource {
     Given,
 }
 
+impl ScaleSource {
+    /// Number in files and messages.
+    pub fn code(self) -> u8 {
+        match self {
+            Self::UpToScale => 0,
+            Self::Given => 1,
+        }
+    }
+
+    pub fn from_code(code: u8) -> Option<Self> {
+        [Self::UpToScale, Self::Given].into_iter().find(|source| source.code() == code)
+    }
+}
+
 /// A keyframe's refined pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeyframePose {
@@ -26,7 +40,7 @@ pub struct KeyframePose {
     pub intrinsics: Intrinsics,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     /// Random-looking but derived from seed and first stamp, so that replays agree.
     pub map_id: [u8; 16],

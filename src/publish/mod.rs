@@ -1,1 +1,32 @@
-//! publish
+//! Snapshots -> messages for other machines.
+//!
+//! `wire` is the only place that knows how a snapshot becomes messages, `assemble` the way back, `type_hash` how
+//! ROS 2 tells message types apart; `zenoh` sends them.
+
+use std::path::PathBuf;
+
+use crate::ros::CdrError;
+
+pub mod assemble;
+pub mod type_hash;
+pub mod wire;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
+
+#[derive(Debug, thiserror::Error)]
+pub enum PublishError {
+    #[error("parameter publish.{name} = {found:?} is of no use, expected {expected}")]
+    Param { name: &'static str, found: String, expected: String },
+    #[error("parameter publish.zenoh_config: {reason}: {}", path.display())]
+    Config { reason: String, path: PathBuf },
+    #[error("cannot open zenoh on {endpoints}: {reason}; check publish.zenoh_listen and publish.zenoh_connect")]
+    Open { endpoints: String, reason: String },
+    #[error("cannot declare {key:?} on zenoh: {reason}")]
+    Declare { key: String, reason: String },
+    #[error("cannot send {key:?} over zenoh: {reason}")]
+    Send { key: String, reason: String },
+    #[error(transparent)]
+    Encode(#[from] CdrError),
+    #[error("zenoh did not close within {waited_secs} s, most likely over a stalled peer; its threads are left behind")]
+    Close { waited_secs: f64 },
+}

@@ -2,8 +2,25 @@
 //!
 //! A source hands out decoded, undistorted frames in order of arrival and counts what it could not use.
 
-use std::path::PathBuf;
+pub mod calibration;
+pub mod decode;
+pub mod images;
+pub mod intake;
+pub mod mcap;
+pub mod rectify;
+pub mod synthetic;
 
+mod bag;
+mod bag_file;
+mod survey;
+mod topics;
+mod truth;
+
+use std::cmp::Ordering;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use crate::config::SourceParams;
 use crate::frame::Frame;
 
 /// What a source met so far; copied into `report.json`.
@@ -21,11 +38,26 @@ pub struct SourceCounts {
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     #[error("cannot open {what}: {reason}; {way_out}: {}", path.display())]
-    Open { what: &'static str, reason: String, way_out: &'static str, path: PathBuf },
-    #[error("{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder")]
+    Open {
+        what: &'static str,
+        reason: String,
+        way_out: &'static str,
+        path: PathBuf,
+    },
+    #[error(
+        "{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder"
+    )]
     Uri { uri: String },
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
     NoImageTopic { found: String, path: PathBuf },
+    #[error("{topic:?} carries {found}, expected sensor_msgs/msg/Image or CompressedImage as cdr: {}", path.display())]
+    TopicType {
+        topic: String,
+        found: String,
+        path: PathBuf,
+    },
+    #[error("{uri:?} is not in this build; {way_out}")]
+    NotInBuild { uri: String, way_out: &'static str },
 }
 
 /// Hands out frames one at a time.
@@ -37,4 +69,164 @@ pub trait Source: Send {
 
     /// Frames still to come, where the source knows (for the progress bar).
     fn len_hint(&self) -> Option<u64>;
+}
+
+/// Opens `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
+pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
+    let not_in_build = |way_out| {
+        Err(SourceError::NotInBuild {
+            uri: uri.to_owned(),
+            way_out,
+        })
+    };
+    match uri.split_once(':') {
+        Some(("mcap", path)) => open_mcap(Path::new(path), params),
+        Some(("images", path)) => open_images(Path::new(path), params),
+        Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
+        Some(("v4l2" | "webcam", _)) => not_in_build(
+            "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
+        ),
+        Some(("ros2" | "zenoh", _)) => not_in_build(
+            "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
+        ),
+        _ => open_path(uri, params),
+    }
+}
+
+fn open_mcap(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(mcap::McapSource::open(path, params)?))
+}
+
+fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(images::ImagesSource::open(path, params)?))
+}
+
+fn open_synthetic(
+    scene: &str,
+    params: &SourceParams,
+    seed: u64,
+) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(synthetic::SyntheticSource::open(
+        scene, params, seed,
+    )?))
+}
+
+/// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.
+fn open_path(uri: &str, params: &SourceParams) -> Result<Box<dyn Source>, SourceError> {
+    let path = Path::new(uri);
+    if path.is_file() {
+        return open_mcap(path, params);
+    }
+    if !path.is_dir() {
+        return Err(SourceError::Uri {
+            uri: uri.to_owned(),
+        });
+    }
+    let holds_mcap = |folder: &Path| {
+        let is_mcap = |name: PathBuf| {
+            name.extension()
+                .is_some_and(|extension| extension == "mcap")
+        };
+        folder.join("metadata.yaml").is_file()
+            || std::fs::read_dir(folder)
+                .is_ok_and(|entries| entries.flatten().any(|entry| is_mcap(entry.path())))
+    };
+    if holds_mcap(path) {
+        return open_mcap(path, params);
+    }
+    let inner = path.join("rosbag2");
+    let pictures = if images::has_pictures(path) {
+        Some(open_images(path, params))
+    } else {
+        None
+    };
+    match pictures {
+        Some(Ok(source)) => Ok(source),
+        _ if holds_mcap(&inner) => open_mcap(&inner, params),
+        Some(failed) => failed,
+        None => open_mcap(path, params),
+    }
+}
+
+/// A whole file that must be small; devices and pipes are none.
+fn read_small(path: &Path, max_bytes: u64) -> Result<Vec<u8>, String> {
+    let metadata = std::fs::metadata(path).map_err(|e| e.to_string())?;
+    if !metadata.is_file() {
+        return Err("not a regular file".to_owned());
+    }
+    if metadata.len() > max_bytes {
+        return Err(format!(
+            "a file of {} bytes, at most {max_bytes} are read",
+            metadata.len()
+        ));
+    }
+    let mut bytes = Vec::new();
+    let file = std::fs::File::open(path).map_err(|e| e.to_string())?;
+    file.take(max_bytes)
+        .read_to_end(&mut bytes)
+        .map_err(|e| e.to_string())?;
+    Ok(bytes)
+}
+
+/// Orders names as people count: `frame9` before `frame10`.
+fn natural_order(a: &str, b: &str) -> Ordering {
+    let (mut a, mut b) = (a, b);
+    loop {
+        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let (char_a, char_b) = (a.chars().next(), b.chars().next());
+        let order = if digits_a.is_empty() || digits_b.is_empty() {
+            char_a.cmp(&char_b)
+        } else {
+            let (number_a, number_b) = (
+                digits_a.trim_start_matches('0'),
+                digits_b.trim_start_matches('0'),
+            );
+            number_a
+                .len()
+                .cmp(&number_b.len())
+                .then_with(|| number_a.cmp(number_b))
+        };
+        let (Ordering::Equal, Some(char_a), Some(char_b)) = (order, char_a, char_b) else {
+            return order;
+        };
+        a = &a[digits_a.len().max(char_a.len_utf8())..];
+        b = &b[digits_b.len().max(char_b.len_utf8())..];
+    }
+}
+
+fn leading_digits(text: &str) -> &str {
+    &text[..text
+        .find(|c: char| !c.is_ascii_digit())
+        .unwrap_or(text.len())]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_sort_as_people_count() {
+        let mut names = [
+            "f10.png",
+            "f9.png",
+            "f1.png",
+            "e99.png",
+            "f010b.png",
+            "f.png",
+            "f9",
+        ];
+        names.sort_by(|a, b| natural_order(a, b));
+        assert_eq!(
+            names,
+            [
+                "e99.png",
+                "f.png",
+                "f1.png",
+                "f9",
+                "f9.png",
+                "f10.png",
+                "f010b.png"
+            ]
+        );
+    }
 }

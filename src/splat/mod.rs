@@ -107,6 +107,9 @@ pub trait Engine: Send {
     /// Replaces a view's pose and clears its optimiser state.
     fn set_pose(&mut self, view_ix: usize, cam_from_map: Rigid);
 
+    /// Replaces the depth that guides a view's depth loss.
+    fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>);
+
     /// One optimiser update on one view. Reads nothing back; a view that sees no splat changes nothing.
     fn step(&mut self, view_ix: usize, settings: &StepSettings);
 
@@ -120,7 +123,8 @@ pub trait Engine: Send {
     fn splats(&mut self) -> Splats;
 
     /// Renders at the given SH degree, black background.
-    fn render(&mut self, intrinsics: &Intrinsics, cam_from_map: &Rigid, sh_degree: u8) -> Rendering;
+    fn render(&mut self, intrinsics: &Intrinsics, cam_from_map: &Rigid, sh_degree: u8)
+    -> Rendering;
 }
 
 impl Splats {
@@ -135,5 +139,50 @@ impl Splats {
     /// Numbers of SH per splat.
     pub fn sh_stride(&self) -> usize {
         3 * (usize::from(self.sh_degree) + 1).pow(2)
+    }
+
+    /// Whether every number of splat `i` is finite.
+    pub fn is_finite(&self, i: usize) -> bool {
+        let stride = self.sh_stride();
+        self.means[i].iter().all(|v| v.is_finite())
+            && self.log_scales[i].iter().all(|v| v.is_finite())
+            && self.quats[i].iter().all(|v| v.is_finite())
+            && self.opacity_logits[i].is_finite()
+            && self.sh[i * stride..(i + 1) * stride]
+                .iter()
+                .all(|v| v.is_finite())
+    }
+
+    /// Drops all behind the first `n`.
+    pub fn truncate(&mut self, n: usize) {
+        let stride = self.sh_stride();
+        self.means.truncate(n);
+        self.log_scales.truncate(n);
+        self.quats.truncate(n);
+        self.opacity_logits.truncate(n);
+        self.anchors.truncate(n);
+        self.sh.truncate(n * stride);
+    }
+
+    /// Only splats whose every number is finite: clients and viewers rely on it.
+    pub fn into_finite(self) -> Self {
+        if (0..self.len()).all(|i| self.is_finite(i)) {
+            return self;
+        }
+        let stride = self.sh_stride();
+        let mut kept = Self {
+            sh_degree: self.sh_degree,
+            ..Self::default()
+        };
+        for i in (0..self.len()).filter(|i| self.is_finite(*i)) {
+            kept.means.push(self.means[i]);
+            kept.log_scales.push(self.log_scales[i]);
+            kept.quats.push(self.quats[i]);
+            kept.opacity_logits.push(self.opacity_logits[i]);
+            kept.anchors.push(self.anchors[i]);
+            kept.sh
+                .extend_from_slice(&self.sh[i * stride..(i + 1) * stride]);
+        }
+        kept
     }
 }

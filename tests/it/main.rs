@@ -2,10 +2,34 @@
 #![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+
+#[cfg(feature = "zenoh")]
+
 mod backends;
+mod bags;
+mod declared_lengths;
 mod engine;
+mod eval;
+mod formats;
 mod gradients;
+mod hostile_bags;
 mod hostile_splats;
+mod html;
+mod layers;
+mod lenses;
+mod opening;
+mod over_zenoh;
+mod pictures;
+mod publish;
 mod reference;
 mod render;
+mod render_poses;
+mod report;
 mod scenes;
+mod sfm;
+mod shaders;
+mod sources;
+mod synthetic;
+mod synthetic_source;
+mod topics;
+mod trajectory;

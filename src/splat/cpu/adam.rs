@@ -7,10 +7,25 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::project::{CHUNK, Projected};
+use super::project_backward::SplatGradients;
+use crate::splat::{Splats, StepSettings};
 
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPS: f32 = 1e-15;
+
+/// Adam's state of all splats, in the layout of `Splats`.
+#[derive(Debug, Default)]
+pub struct Optimiser {
+    means: Moments,
+    log_scales: Moments,
+    quats: Moments,
+    opacity_logits: Moments,
+    sh: Moments,
+    /// Updates that each splat has had.
+    ages: Vec<u32>,
+    corrections: Vec<Correction>,
+}
 
 /// First and second moment of one attribute, laid out as its parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -34,6 +49,109 @@ pub struct Attribute<'a> {
 
 /// What bias correction makes of the moments: `1 / (1 - beta_1^t)` and `1 / sqrt(1 - beta_2^t)`; `None`: no update.
 pub type Correction = Option<[f32; 2]>;
+
+impl Optimiser {
+    /// Splats behind those that were there start at rest.
+    pub(crate) fn resize(&mut self, splats: &Splats) {
+        let n = splats.len();
+        self.ages.resize(n, 0);
+        for (moments, stride) in self.moments_mut(splats.sh_stride()) {
+            moments.first.resize(n * stride, 0.0);
+            moments.second.resize(n * stride, 0.0);
+        }
+    }
+
+    pub(crate) fn retain(&mut self, sh_stride: usize, keep: &[bool]) {
+        retain_rows(&mut self.ages, 1, keep);
+        for (moments, stride) in self.moments_mut(sh_stride) {
+            retain_rows(&mut moments.first, stride, keep);
+            retain_rows(&mut moments.second, stride, keep);
+        }
+    }
+
+    /// Moves the visible splats. Returns how many were left alone because their gradient is not finite.
+    pub(crate) fn update(
+        &mut self,
+        splats: &mut Splats,
+        projected: &Projected,
+        gradients: &SplatGradients,
+        settings: &StepSettings,
+    ) -> usize {
+        let g = gradients;
+        let n_skipped = age(
+            projected,
+            &g.is_finite,
+            &mut self.ages,
+            &mut self.corrections,
+        );
+        let sh_stride = splats.sh_stride();
+        let corrections = &self.corrections;
+        let run = |params, moments, grads, [stride, grad_stride]: [usize; 2], rates| {
+            let attribute = Attribute {
+                params,
+                moments,
+                stride,
+                grads,
+                grad_stride,
+                rates,
+            };
+            adam(attribute, projected, corrections);
+        };
+        let means = splats.means.as_flattened_mut();
+        run(
+            means,
+            &mut self.means,
+            g.means.as_flattened(),
+            [3; 2],
+            [settings.lr_mean; 2],
+        );
+        let scales = splats.log_scales.as_flattened_mut();
+        let scale_rates = [settings.lr_scale; 2];
+        run(
+            scales,
+            &mut self.log_scales,
+            g.log_scales.as_flattened(),
+            [3; 2],
+            scale_rates,
+        );
+        let quats = splats.quats.as_flattened_mut();
+        run(
+            quats,
+            &mut self.quats,
+            g.quats.as_flattened(),
+            [4; 2],
+            [settings.lr_quat; 2],
+        );
+        let logits = &mut splats.opacity_logits;
+        run(
+            logits,
+            &mut self.opacity_logits,
+            &g.opacity_logits,
+            [1; 2],
+            [settings.lr_opacity; 2],
+        );
+        let sh_rates = [settings.lr_sh0, settings.lr_sh_rest];
+        run(
+            &mut splats.sh,
+            &mut self.sh,
+            &g.sh,
+            [sh_stride, g.sh_stride],
+            sh_rates,
+        );
+        n_skipped
+    }
+
+    /// With the numbers of one splat, since moments are flat.
+    fn moments_mut(&mut self, sh_stride: usize) -> [(&mut Moments, usize); 5] {
+        [
+            (&mut self.means, 3),
+            (&mut self.log_scales, 3),
+            (&mut self.quats, 4),
+            (&mut self.opacity_logits, 1),
+            (&mut self.sh, sh_stride),
+        ]
+    }
+}
 
 /// Ages every visible splat that has a finite gradient by one step. Returns how many had none.
 pub fn age(
@@ -125,10 +243,12 @@ fn update(
     }
 }
 
-impl Moments {
-    /// Room for more splats, at rest.
-    pub(crate) fn resize(&mut self, n: usize) {
-        self.first.resize(n, 0.0);
-        self.second.resize(n, 0.0);
+/// Keeps row i of `stride` values when `keep[i]`.
+pub(crate) fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[bool]) {
+    let mut end = 0;
+    for (i, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
+        values.copy_within(i * stride..(i + 1) * stride, end);
+        end += stride;
     }
+    values.truncate(end);
 }

@@ -15,7 +15,7 @@ pub mod raster_backward;
 mod sh;
 mod ssim;
 
-use adam::{Attribute, Correction, Moments};
+use adam::{Optimiser, retain_rows};
 use bin::Tiles;
 use loss::{LossValue, PixelGradients, Target};
 use pose_adam::PoseAdam;
@@ -24,7 +24,10 @@ use project_backward::{Forward, SplatGradients};
 use raster::Raster;
 use raster_backward::InstanceGradients;
 
+use std::sync::Arc;
+
 use crate::camera::Intrinsics;
+use crate::frame::DepthMap;
 use crate::pose::Rigid;
 use crate::splat::{Engine, Rendering, Splats, StepSettings, StepStats, TrainingView};
 
@@ -37,6 +40,7 @@ pub struct CpuEngine {
     pass: Pass,
     stats: StepStats,
     n_skipped_updates: u64,
+    n_left_out: u64,
 }
 
 /// Gradient of one view's loss, for tests and diagnosis. Arrays as in `Splats`, 0 where a splat is not visible.
@@ -64,19 +68,6 @@ pub struct Gradients {
 struct View {
     view: TrainingView,
     adam: PoseAdam,
-}
-
-/// Adam's state, in the layout of `Splats`.
-#[derive(Debug, Default)]
-struct Optimiser {
-    means: Moments,
-    log_scales: Moments,
-    quats: Moments,
-    opacity_logits: Moments,
-    sh: Moments,
-    /// Updates that each splat has had.
-    ages: Vec<u32>,
-    corrections: Vec<Correction>,
 }
 
 /// Buffers of one way there and back.
@@ -130,13 +121,21 @@ impl CpuEngine {
         self.n_skipped_updates
     }
 
-    fn count_skipped(&mut self, n: usize) {
-        if n > 0 && self.n_skipped_updates == 0 {
+    /// Warns of what went wrong in a step, once of each kind.
+    fn count_troubles(&mut self, n_skipped: usize) {
+        if n_skipped > 0 && self.n_skipped_updates == 0 {
             tracing::warn!(
-                "{n} gradients are not finite: their splats or poses are not updated; said once, counted on"
+                "{n_skipped} gradients are not finite: their splats or poses are not updated; said once"
             );
         }
-        self.n_skipped_updates += n as u64;
+        self.n_skipped_updates += n_skipped as u64;
+        let n_left_out = self.pass.tiles.n_left_out;
+        if n_left_out > 0 && self.n_left_out == 0 {
+            tracing::warn!(
+                "splats are too large: the {n_left_out} farthest of a view are left out; said once"
+            );
+        }
+        self.n_left_out += n_left_out as u64;
     }
 }
 
@@ -178,11 +177,7 @@ impl Engine for CpuEngine {
         retain_rows(&mut all.opacity_logits, 1, keep);
         retain_rows(&mut all.sh, sh_stride, keep);
         retain_rows(&mut all.anchors, 1, keep);
-        retain_rows(&mut self.optimiser.ages, 1, keep);
-        for (moments, stride) in self.optimiser.moments_mut(sh_stride) {
-            retain_rows(&mut moments.first, stride, keep);
-            retain_rows(&mut moments.second, stride, keep);
-        }
+        self.optimiser.retain(sh_stride, keep);
     }
 
     fn overwrite(&mut self, splats: &Splats) {
@@ -225,6 +220,10 @@ impl Engine for CpuEngine {
         view.adam = PoseAdam::default();
     }
 
+    fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
+        self.views[view_ix].view.depth = depth;
+    }
+
     fn step(&mut self, view_ix: usize, settings: &StepSettings) {
         let view = &mut self.views[view_ix];
         let value = self.pass.differentiate(&self.splats, &view.view, settings);
@@ -247,11 +246,14 @@ impl Engine for CpuEngine {
             }
         }
         if settings.train_splats {
-            n_skipped += self
-                .optimiser
-                .update(&mut self.splats, &self.pass, settings);
+            n_skipped += self.optimiser.update(
+                &mut self.splats,
+                &self.pass.projected,
+                &self.pass.gradients,
+                settings,
+            );
         }
-        self.count_skipped(n_skipped);
+        self.count_troubles(n_skipped);
     }
 
     fn take_stats(&mut self) -> StepStats {
@@ -335,93 +337,6 @@ impl Pass {
     }
 }
 
-impl Optimiser {
-    fn resize(&mut self, splats: &Splats) {
-        let n = splats.len();
-        self.ages.resize(n, 0);
-        for (moments, stride) in self.moments_mut(splats.sh_stride()) {
-            moments.resize(n * stride);
-        }
-    }
-
-    /// With the numbers of one splat: `retain_rows` and `resize` need them, since moments are flat.
-    fn moments_mut(&mut self, sh_stride: usize) -> [(&mut Moments, usize); 5] {
-        [
-            (&mut self.means, 3),
-            (&mut self.log_scales, 3),
-            (&mut self.quats, 4),
-            (&mut self.opacity_logits, 1),
-            (&mut self.sh, sh_stride),
-        ]
-    }
-
-    /// Returns the number of splats left alone because their gradient is not finite.
-    fn update(&mut self, splats: &mut Splats, pass: &Pass, settings: &StepSettings) -> usize {
-        let (projected, g) = (&pass.projected, &pass.gradients);
-        let n_skipped = adam::age(
-            projected,
-            &g.is_finite,
-            &mut self.ages,
-            &mut self.corrections,
-        );
-        let sh_stride = splats.sh_stride();
-        let one = |rate| [rate, rate];
-        let corrections = &self.corrections;
-        let run = |params, moments, [stride, grad_stride]: [usize; 2], grads, rates| {
-            adam::adam(
-                Attribute {
-                    params,
-                    moments,
-                    stride,
-                    grads,
-                    grad_stride,
-                    rates,
-                },
-                projected,
-                corrections,
-            );
-        };
-        run(
-            splats.means.as_flattened_mut(),
-            &mut self.means,
-            [3, 3],
-            g.means.as_flattened(),
-            one(settings.lr_mean),
-        );
-        let scales = g.log_scales.as_flattened();
-        run(
-            splats.log_scales.as_flattened_mut(),
-            &mut self.log_scales,
-            [3, 3],
-            scales,
-            one(settings.lr_scale),
-        );
-        run(
-            splats.quats.as_flattened_mut(),
-            &mut self.quats,
-            [4, 4],
-            g.quats.as_flattened(),
-            one(settings.lr_quat),
-        );
-        run(
-            &mut splats.opacity_logits,
-            &mut self.opacity_logits,
-            [1, 1],
-            &g.opacity_logits,
-            one(settings.lr_opacity),
-        );
-        let sh_rates = [settings.lr_sh0, settings.lr_sh_rest];
-        run(
-            &mut splats.sh,
-            &mut self.sh,
-            [sh_stride, g.sh_stride],
-            &g.sh,
-            sh_rates,
-        );
-        n_skipped
-    }
-}
-
 impl Splats {
     /// Our own mistake when it fails: readers of files check before.
     fn assert_consistent(&self) {
@@ -446,29 +361,16 @@ impl Splats {
     }
 }
 
-/// Keeps row i of `stride` values when `keep[i]`.
-fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[bool]) {
-    let mut end = 0;
-    for (i, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
-        values.copy_within(i * stride..(i + 1) * stride, end);
-        end += stride;
-    }
-    values.truncate(end);
-}
-
 fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
-        if std::arch::is_x86_feature_detected!("avx512f")
-            && std::arch::is_x86_feature_detected!("avx512vl")
-        {
-            return "avx512";
+        use std::arch::is_x86_feature_detected as has;
+        if !has!("avx2") || !has!("fma") {
+            return "sse2";
         }
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma")
-        {
-            return "avx2+fma";
-        }
-        "sse2"
+        let has_avx512 =
+            has!("avx512f") && has!("avx512vl") && has!("avx512bw") && has!("avx512dq");
+        if has_avx512 { "avx512" } else { "avx2+fma" }
     }
     #[cfg(target_arch = "aarch64")]
     {

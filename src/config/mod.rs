@@ -3,14 +3,18 @@
 //! The embedded file is the only home of defaults and ranges: the structs below have neither. A user's file or
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
+mod range;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::config::range::{Range, ranges_of_comments};
+
 /// The shipped `launch/params.yaml`.
-pub const PARAMS_YAML: &str = include_str!("../launch/params.yaml");
+pub const PARAMS_YAML: &str = include_str!("../../launch/params.yaml");
 
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -19,12 +23,21 @@ pub enum ConfigError {
     #[error("the parameter file is not ROS 2 parameter YAML (splat_mapper: ros__parameters: ...): {reason}: {}", path.display())]
     Form { reason: String, path: PathBuf },
     #[error("unknown parameter {key:?}{}; launch/params.yaml lists all", nearest.as_ref().map(|n| format!(", nearest is {n:?}")).unwrap_or_default())]
-    UnknownKey { key: String, nearest: Option<String> },
+    UnknownKey {
+        key: String,
+        nearest: Option<String>,
+    },
     #[error("parameter {key} = {found} is out of range, expected {expected}")]
-    OutOfRange { key: String, found: String, expected: String },
+    OutOfRange {
+        key: String,
+        found: String,
+        expected: String,
+    },
     #[error("{found:?} is no setting, expected key=value, for example map.steps=500")]
     Setting { found: String },
-    #[error("parameters select.batch_overlap = {overlap} and select.batch_size = {size} do not fit: the overlap must be smaller")]
+    #[error(
+        "parameters select.batch_overlap = {overlap} and select.batch_size = {size} do not fit: the overlap must be smaller"
+    )]
     Overlap { overlap: usize, size: usize },
 }
 
@@ -70,6 +83,7 @@ pub struct SourceParams {
 pub struct SelectParams {
     pub all: bool,
     pub min_flow: f64,
+    pub min_parallax: f64,
     pub max_rate_hz: f64,
     pub min_sharpness: f64,
     pub max_wait: f64,
@@ -109,6 +123,7 @@ pub struct MvsParams {
 #[serde(deny_unknown_fields)]
 pub struct MapParams {
     pub steps: u64,
+    pub max_side: u32,
     pub final_share: f64,
     pub max_splats: usize,
     pub seeds_per_keyframe: usize,
@@ -143,55 +158,6 @@ pub struct PublishParams {
     pub linger_secs: f64,
 }
 
-/// What a value may be, read from the comment behind its default.
-#[derive(Debug, Clone, PartialEq)]
-enum Range {
-    Number { min: f64, max: f64 },
-    Choice(Vec<String>),
-    Flag,
-    Text,
-}
-
-impl Range {
-    fn of_comment(comment: &str) -> Option<Self> {
-        if let Some(rest) = comment.strip_prefix('[') {
-            let (min, max) = rest.split_once(']')?.0.split_once(',')?;
-            return Some(Self::Number { min: min.trim().parse().ok()?, max: max.trim().parse().ok()? });
-        }
-        if let Some(rest) = comment.strip_prefix('{') {
-            let names = rest.split_once('}')?.0.split(',');
-            return Some(Self::Choice(names.map(|name| name.trim().to_owned()).collect()));
-        }
-        if comment.starts_with("flag") {
-            return Some(Self::Flag);
-        }
-        comment.starts_with("text").then_some(Self::Text)
-    }
-
-    /// `whole`: the default is an integer, so values must be too.
-    fn allows(&self, value: &Value, whole: bool) -> bool {
-        match self {
-            Self::Number { min, max } => value
-                .as_f64()
-                .is_some_and(|v| v >= *min && v <= *max && !(whole && v.fract() != 0.0)),
-            Self::Choice(names) => value.as_str().is_some_and(|v| names.iter().any(|name| name == v)),
-            Self::Flag => value.is_boolean(),
-            Self::Text => value.is_string(),
-        }
-    }
-}
-
-impl std::fmt::Display for Range {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Number { min, max } => write!(f, "a number in [{min}, {max}]"),
-            Self::Choice(names) => write!(f, "one of {}", names.join(", ")),
-            Self::Flag => write!(f, "true or false"),
-            Self::Text => write!(f, "text"),
-        }
-    }
-}
-
 /// Values by dotted key; every key of the embedded file is there.
 #[derive(Debug, Clone)]
 pub struct Settings {
@@ -209,9 +175,14 @@ impl Settings {
         let ranges = values
             .iter()
             .map(|(key, value)| {
-                let range = ranges.get(key).unwrap_or_else(|| panic!("params.yaml states no range for {key}"));
+                let range = ranges
+                    .get(key)
+                    .unwrap_or_else(|| panic!("params.yaml states no range for {key}"));
                 // A default written with a point may be fractional, one without must be whole.
-                (key.clone(), (range.clone(), value.is_i64() || value.is_u64()))
+                (
+                    key.clone(),
+                    (range.clone(), value.is_i64() || value.is_u64()),
+                )
             })
             .collect();
         Self { values, ranges }
@@ -219,20 +190,32 @@ impl Settings {
 
     /// Applies a user's parameter file over what is there.
     pub fn merge_file(&mut self, path: &Path) -> Result<(), ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|e| ConfigError::Read { reason: e.to_string(), path: path.to_owned() })?;
-        let tree = parse_file(&text).map_err(|reason| ConfigError::Form { reason, path: path.to_owned() })?;
+        let text = std::fs::read_to_string(path).map_err(|e| ConfigError::Read {
+            reason: e.to_string(),
+            path: path.to_owned(),
+        })?;
+        let tree = parse_file(&text).map_err(|reason| ConfigError::Form {
+            reason,
+            path: path.to_owned(),
+        })?;
         let mut values = BTreeMap::new();
         flatten("", &tree, &mut values);
-        values.into_iter().try_for_each(|(key, value)| self.set(&key, value))
+        values
+            .into_iter()
+            .try_for_each(|(key, value)| self.set(&key, value))
     }
 
     /// Applies one `key=value` of the command line; the value is YAML.
     pub fn merge_setting(&mut self, setting: &str) -> Result<(), ConfigError> {
-        let fail = || ConfigError::Setting { found: setting.to_owned() };
+        let fail = || ConfigError::Setting {
+            found: setting.to_owned(),
+        };
         let (key, text) = setting.split_once('=').ok_or_else(fail)?;
         let key = key.trim();
-        let is_text = self.ranges.get(key).is_some_and(|(range, _)| matches!(range, Range::Text | Range::Choice(_)));
+        let is_text = self
+            .ranges
+            .get(key)
+            .is_some_and(|(range, _)| matches!(range, Range::Text | Range::Choice(_)));
         let value = if is_text {
             Value::String(text.trim().to_owned())
         } else {
@@ -244,7 +227,10 @@ impl Settings {
     /// Sets one key after checking it against its range.
     pub fn set(&mut self, key: &str, value: Value) -> Result<(), ConfigError> {
         let Some((range, whole)) = self.ranges.get(key) else {
-            return Err(ConfigError::UnknownKey { key: key.to_owned(), nearest: self.nearest_key(key) });
+            return Err(ConfigError::UnknownKey {
+                key: key.to_owned(),
+                nearest: self.nearest_key(key),
+            });
         };
         if !range.allows(&value, *whole) {
             let whole = if *whole { " (whole)" } else { "" };
@@ -277,26 +263,36 @@ impl Settings {
                     root.insert(key.clone(), value.clone());
                 }
                 Some((group, name)) => {
-                    let group = root.entry(group).or_insert_with(|| Value::Object(serde_json::Map::new()));
+                    let group = root
+                        .entry(group)
+                        .or_insert_with(|| Value::Object(serde_json::Map::new()));
                     if let Value::Object(group) = group {
                         group.insert(name.to_owned(), value.clone());
                     }
                 }
             }
         }
-        let params: Params =
-            serde_json::from_value(Value::Object(root)).expect("params.yaml and config.rs name the same keys");
+        let params: Params = serde_json::from_value(Value::Object(root))
+            .expect("params.yaml and config.rs name the same keys");
         let select = &params.select;
         if select.batch_overlap >= select.batch_size {
-            return Err(ConfigError::Overlap { overlap: select.batch_overlap, size: select.batch_size });
+            return Err(ConfigError::Overlap {
+                overlap: select.batch_overlap,
+                size: select.batch_size,
+            });
         }
         Ok(params)
     }
 
     fn nearest_key(&self, key: &str) -> Option<String> {
         let tail = key.rsplit('.').next().unwrap_or(key);
-        let by_tail = self.values.keys().find(|known| known.rsplit('.').next() == Some(tail));
-        by_tail.or_else(|| self.values.keys().find(|known| known.contains(tail))).cloned()
+        let by_tail = self
+            .values
+            .keys()
+            .find(|known| known.rsplit('.').next() == Some(tail));
+        by_tail
+            .or_else(|| self.values.keys().find(|known| known.contains(tail)))
+            .cloned()
     }
 }
 
@@ -305,15 +301,25 @@ fn parse_file(text: &str) -> Result<Value, String> {
     let root: Value = serde_saphyr::from_str(text).map_err(|e| e.to_string())?;
     let node = root.get("splat_mapper").or_else(|| root.get("/**"));
     let node = node.ok_or("no top-level key splat_mapper")?;
-    let tree = node.get("ros__parameters").ok_or("no key ros__parameters under the node's name")?;
-    if tree.is_object() { Ok(tree.clone()) } else { Err("ros__parameters holds no keys".to_owned()) }
+    let tree = node
+        .get("ros__parameters")
+        .ok_or("no key ros__parameters under the node's name")?;
+    if tree.is_object() {
+        Ok(tree.clone())
+    } else {
+        Err("ros__parameters holds no keys".to_owned())
+    }
 }
 
 fn flatten(prefix: &str, tree: &Value, out: &mut BTreeMap<String, Value>) {
     match tree {
         Value::Object(entries) => {
             for (name, value) in entries {
-                let key = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
+                let key = if prefix.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{prefix}.{name}")
+                };
                 flatten(&key, value, out);
             }
         }
@@ -323,75 +329,5 @@ fn flatten(prefix: &str, tree: &Value, out: &mut BTreeMap<String, Value>) {
     }
 }
 
-/// Reads the ranges out of the comments of the embedded file, which we write ourselves: two levels, two spaces each.
-fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
-    let mut group = String::new();
-    let mut ranges = BTreeMap::new();
-    for line in text.lines() {
-        let trimmed = line.trim_start();
-        let indent = line.len() - trimmed.len();
-        let Some((name, rest)) = trimmed.split_once(':') else { continue };
-        if indent < 4 || trimmed.starts_with('#') {
-            continue;
-        }
-        let key = if indent == 4 { name.to_owned() } else { format!("{group}.{name}") };
-        match rest.split_once(" # ").and_then(|(_, comment)| Range::of_comment(comment.trim())) {
-            Some(range) => {
-                ranges.insert(key, range);
-            }
-            None => group = name.to_owned(),
-        }
-    }
-    ranges
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn shipped_values_fit_their_own_ranges_and_the_structs() {
-        let settings = Settings::shipped();
-        for (key, value) in &settings.values {
-            let (range, whole) = &settings.ranges[key];
-            assert!(range.allows(value, *whole), "{key} = {value} is outside {range}");
-        }
-        settings.params().unwrap();
-    }
-
-    #[test]
-    fn every_numeric_bound_can_be_set_and_read_back() {
-        for key in Settings::shipped().values.keys() {
-            let mut settings = Settings::shipped();
-            if let (Range::Number { min, max }, _) = settings.ranges[key].clone() {
-                settings.set(key, Value::from(min)).unwrap();
-                settings.set(key, Value::from(max)).unwrap();
-                let fits = settings.params();
-                assert!(matches!(fits, Ok(_) | Err(ConfigError::Overlap { .. })), "{key}: {fits:?}");
-                settings.set(key, Value::from(max + 1.0)).unwrap_err();
-            }
-        }
-    }
-
-    #[test]
-    fn errors_name_key_value_and_range() {
-        let mut settings = Settings::shipped();
-        let message = |e: ConfigError| e.to_string();
-        let high = message(settings.merge_setting("map.sh_degree=4").unwrap_err());
-        assert_eq!(high, "parameter map.sh_degree = 4 is out of range, expected a number in [0, 3] (whole)");
-        let unknown = message(settings.merge_setting("step=4").unwrap_err());
-        assert!(unknown.contains("\"step\"") && unknown.contains("map.steps"), "{unknown}");
-        assert!(message(settings.merge_setting("steps").unwrap_err()).contains("key=value"));
-        assert!(settings.merge_setting("backend=cuda").is_err());
-    }
-
-    #[test]
-    fn a_whole_number_is_fine_where_a_fraction_may_stand() {
-        let mut settings = Settings::shipped();
-        settings.merge_setting("select.min_flow=1").unwrap();
-        settings.merge_setting("publish.namespace=7").unwrap();
-        settings.merge_setting("map.steps=5e2").unwrap();
-        let params = settings.params().unwrap();
-        assert_eq!((params.select.min_flow, params.map.steps), (1.0, 500));
-    }
-}
+mod tests;

@@ -1,0 +1,27 @@
+# The four lines that people and CI run. `make demo` and `make test` install what is missing first.
+.PHONY: demo test lint bench setup
+
+# Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
+demo:
+	scripts/setup build
+	cargo build --release --locked
+	cargo run --release --locked --quiet -- replay recordings/demo.mcap --out out/demo
+	cargo run --release --locked --quiet -- eval out/demo --reference recordings/demo.tum
+	@echo "Look at out/demo/report.html; the map is out/demo/map.ply"
+
+test:
+	scripts/setup test
+	cargo test --release --locked
+
+lint:
+	scripts/setup lint
+	cargo fmt --check
+	cargo clippy --release --locked --all-targets -- -D warnings
+
+# Figures for docs/BENCHMARKS.md: every stage and the whole step, sizes in the names.
+bench:
+	scripts/setup build
+	cargo bench --locked --bench stages
+
+setup:
+	scripts/setup all

@@ -1,0 +1,143 @@
+//! `run` and `replay`: arguments -> a job, its progress on the terminal, its run directory.
+
+use std::io::IsTerminal;
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::cli::{ParamArgs, ReplayArgs, RunArgs, Usage, say};
+use crate::config::{ConfigError, Settings};
+use crate::node::pipeline::{self, Subscriber};
+use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
+use crate::source;
+
+pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
+    let mut settings = settings(&args.params)?;
+    if settings.params().map_err(usage)?.source.rate == 0.0 {
+        settings.set("source.rate", 1.0.into()).map_err(usage)?;
+    }
+    map(&settings, &args.source, args.out.as_deref())
+}
+
+pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+    let mut settings = settings(&args.params)?;
+    let rate = match args.rate.as_deref() {
+        None => None,
+        Some("max") => Some(0.0),
+        Some(text) => Some(text.parse::<f64>().ok().filter(|rate| *rate > 0.0).ok_or_else(|| {
+            Usage(format!("--rate {text} is neither a number above 0 nor max"))
+        })?),
+    };
+    let flags: [(&str, Option<serde_json::Value>); 8] = [
+        ("source.rate", rate.map(Into::into)),
+        ("backend", args.backend.clone().map(Into::into)),
+        ("geometry", args.geometry.clone().map(Into::into)),
+        ("map.steps", args.steps.map(Into::into)),
+        ("source.max_side", args.max_side.map(Into::into)),
+        ("map.max_side", args.max_side.map(Into::into)),
+        ("seed", args.seed.map(Into::into)),
+        ("map.holdout", args.holdout.map(Into::into)),
+    ];
+    for (key, value) in flags {
+        if let Some(value) = value {
+            settings.set(key, value).map_err(usage)?;
+        }
+    }
+    map(&settings, &args.input, args.out.as_deref())
+}
+
+fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
+    let mut settings = Settings::shipped();
+    if let Some(file) = &args.params {
+        settings.merge_file(file)?;
+    }
+    for setting in &args.set {
+        settings.merge_setting(setting).map_err(usage)?;
+    }
+    Ok(settings)
+}
+
+fn usage(error: ConfigError) -> Usage {
+    Usage(error.to_string())
+}
+
+fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<ExitCode> {
+    let params = settings.params().map_err(usage)?;
+    let is_terminal = std::io::stderr().is_terminal();
+    if let Some(out) = out {
+        run_dir::prepare(out)?;
+    }
+    run_dir::start_log(out, is_terminal)?;
+    let source = source::open(input, &params.source, params.seed)?;
+    let stop = Stop::default();
+    stop_on_ctrl_c(&stop)?;
+    let subscriber: Option<Box<dyn Subscriber>> = subscriber(&params.publish)?;
+    let is_live = params.source.rate > 0.0;
+    let job = Job { source, params: params.clone(), is_live, stop: stop.clone() };
+    let bar = bar(is_terminal);
+    let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
+    bar.finish_and_clear();
+    let mut outcome = outcome?;
+    let summary = run_dir::finish(&mut outcome, settings, out, input)?;
+    say(summary);
+    linger(&mut outcome, params.publish.linger_secs, &stop);
+    verdict(&outcome, input)
+}
+
+/// Done when there is a map and no stage failed.
+fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
+    if let Some(error) = &outcome.error {
+        anyhow::bail!("{error}: {input}");
+    }
+    if outcome.snapshot.poses.is_empty() {
+        let counts = &outcome.counts;
+        let fault = counts.fault.as_ref().map(|f| format!("; {f}")).unwrap_or_default();
+        let why = if outcome.n_selected == 0 {
+            format!("none of {} frames could be used ({} undecodable)", counts.received, counts.undecodable)
+        } else {
+            outcome.geometry_note.clone().unwrap_or_else(|| "no parallax was seen between keyframes".to_owned())
+        };
+        anyhow::bail!(
+            "no map: {why}; {} of {} frames were keyframes{fault}; a map needs a camera that moves sideways past textured things: {input}",
+            outcome.n_selected,
+            counts.received,
+        );
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
+    let stop = stop.clone();
+    ctrlc::set_handler(move || {
+        if stop.is_asked() {
+            #[expect(clippy::exit, reason = "the second Ctrl-C ends at once, whatever the stages do")]
+            std::process::exit(130);
+        }
+        stop.ask();
+    })
+    .context("cannot listen for Ctrl-C")
+}
+
+fn bar(is_terminal: bool) -> ProgressBar {
+    if !is_terminal {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} steps  {msg}  {elapsed}");
+    ProgressBar::new(0).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+fn show(bar: &ProgressBar, progress: Progress) {
+    let text = format!(
+        "{} of {} keyframes, {} splats",
+        progress.n_placed, progress.n_keyframes, progress.n_splats
+    );
+    if bar.is_hidden() {
+        tracing::info!("step {} of {}: {text}", progress.n_steps, progress.steps_planned);
+    } else {
+        bar.set_length(progress.steps_planned.max(progress.n_steps));
+        bar.set_position(progress.n_steps);
+        bar.set_message(text);
+    }
+}

@@ -1,0 +1,193 @@
+//! The command line: arguments only. What a command does stands in `node`, `eval` and `source`.
+
+mod commands;
+mod mapping;
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+/// Camera frames in, refined poses and a 3D Gaussian splat map out.
+#[derive(Debug, Parser)]
+#[command(version, about, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Maps a source until it ends or Ctrl-C
+    Run(RunArgs),
+    /// Maps a recording or a folder of images and writes a run directory
+    Replay(ReplayArgs),
+    /// Renders a recording with exact poses and depth
+    Synth(SynthArgs),
+    /// Compares the keyframes of a run with reference poses
+    Eval(EvalArgs),
+    /// Renders a map from given poses
+    Render(RenderArgs),
+    /// Converts a map to another format
+    Export(ExportArgs),
+    /// Says what is missing on this machine, and the line that fixes it
+    Doctor,
+}
+
+/// Parameters, as launch/params.yaml lists them.
+#[derive(Debug, Args)]
+struct ParamArgs {
+    /// File in ROS 2 parameter form; any subset of launch/params.yaml
+    #[arg(long, value_name = "FILE")]
+    params: Option<PathBuf>,
+    /// One parameter, for example map.max_splats=100000; repeatable
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+struct RunArgs {
+    /// mcap:PATH, images:DIR or synthetic:SCENE
+    #[arg(long, value_name = "URI")]
+    source: String,
+    /// Run directory to write at the end
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
+#[derive(Debug, Args)]
+struct ReplayArgs {
+    /// MCAP file, rosbag2 folder, image folder or source URI
+    #[arg(value_name = "BAG_OR_DIR")]
+    input: String,
+    /// Run directory to write
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Multiple of the recorded speed, or max; with a number late frames are dropped and counted
+    #[arg(long, value_name = "R|max")]
+    rate: Option<String>,
+    /// auto, wgpu or cpu
+    #[arg(long)]
+    backend: Option<String>,
+    /// sfm or known
+    #[arg(long)]
+    geometry: Option<String>,
+    /// Optimiser updates of the whole run
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Longer side of the working picture, in pixels
+    #[arg(long, value_name = "PX")]
+    max_side: Option<u32>,
+    /// Everything random follows from it
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Keeps every N-th keyframe out of optimisation to measure quality; 0 = off
+    #[arg(long, value_name = "N")]
+    holdout: Option<u32>,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
+#[derive(Debug, Args)]
+struct SynthArgs {
+    /// room, facade or corridor
+    scene: String,
+    /// Recording to write; its poses go beside it as .tum
+    #[arg(long, value_name = "FILE.mcap")]
+    out: PathBuf,
+    #[arg(long)]
+    frames: Option<u32>,
+    /// Pixels
+    #[arg(long)]
+    width: Option<u32>,
+    /// Pixels
+    #[arg(long)]
+    height: Option<u32>,
+    /// Horizontal field of view in degrees
+    #[arg(long)]
+    fov: Option<f64>,
+    /// pinhole, radial or fisheye
+    #[arg(long)]
+    lens: Option<String>,
+    #[arg(long)]
+    seed: Option<u64>,
+    /// One more option, for example noise=2, exposure=0.3, blur=0.5; repeatable
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+struct EvalArgs {
+    /// Run directory of a replay
+    run_dir: PathBuf,
+    /// Reference poses, camera to world, TUM format
+    #[arg(long, value_name = "poses_tum.txt")]
+    reference: PathBuf,
+    /// Prints JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Args)]
+struct RenderArgs {
+    /// map.splatmap or map.ply
+    map: PathBuf,
+    /// Poses to render from, camera to map, TUM format
+    #[arg(long, value_name = "FILE")]
+    poses: PathBuf,
+    /// Pinhole camera as JSON: width, height, fx, fy, cx, cy; whole numbers are pixel centres
+    #[arg(long, value_name = "FILE")]
+    intrinsics: PathBuf,
+    /// Folder for the PNG files
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Writes depth as 16-bit PNG too
+    #[arg(long)]
+    depth: bool,
+    /// auto, wgpu or cpu
+    #[arg(long, default_value = "auto")]
+    backend: String,
+}
+
+#[derive(Debug, Args)]
+struct ExportArgs {
+    /// map.splatmap or map.ply
+    map: PathBuf,
+    /// OUT.ply
+    out: PathBuf,
+}
+
+/// Runs the program: exit 0 done, 1 failed with one line that says why, 2 usage.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let result = match cli.command {
+        Command::Run(args) => mapping::run(&args),
+        Command::Replay(args) => mapping::replay(&args),
+        Command::Synth(args) => commands::synth(&args),
+        Command::Eval(args) => commands::eval(&args),
+        Command::Render(args) => commands::render(&args),
+        Command::Export(args) => commands::export(&args),
+        Command::Doctor => commands::doctor(),
+    };
+    match result {
+        Ok(code) => code,
+        Err(error) => {
+            // The one place where an error is printed; a closed stderr is no reason to fail differently.
+            writeln!(std::io::stderr(), "splat-mapper: {error:#}").ok();
+            if error.is::<Usage>() { ExitCode::from(2) } else { ExitCode::FAILURE }
+        }
+    }
+}
+
+/// An argument that clap cannot check.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct Usage(String);
+
+/// Writes a line to stdout; a closed pipe is the reader's choice.
+fn say(text: impl std::fmt::Display) {
+    writeln!(std::io::stdout(), "{text}").ok();
+}

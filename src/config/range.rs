@@ -1,0 +1,92 @@
+//! Comments of `launch/params.yaml` -> what each value may be.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+/// What a value may be, read from the comment behind its default.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Range {
+    Number { min: f64, max: f64 },
+    Choice(Vec<String>),
+    Flag,
+    Text,
+}
+
+impl Range {
+    fn of_comment(comment: &str) -> Option<Self> {
+        if let Some(rest) = comment.strip_prefix('[') {
+            let (min, max) = rest.split_once(']')?.0.split_once(',')?;
+            return Some(Self::Number {
+                min: min.trim().parse().ok()?,
+                max: max.trim().parse().ok()?,
+            });
+        }
+        if let Some(rest) = comment.strip_prefix('{') {
+            let names = rest.split_once('}')?.0.split(',');
+            return Some(Self::Choice(
+                names.map(|name| name.trim().to_owned()).collect(),
+            ));
+        }
+        if comment.starts_with("flag") {
+            return Some(Self::Flag);
+        }
+        comment.starts_with("text").then_some(Self::Text)
+    }
+
+    /// `whole`: the default is an integer, so values must be too.
+    pub(super) fn allows(&self, value: &Value, whole: bool) -> bool {
+        match self {
+            Self::Number { min, max } => value
+                .as_f64()
+                .is_some_and(|v| v >= *min && v <= *max && !(whole && v.fract() != 0.0)),
+            Self::Choice(names) => value
+                .as_str()
+                .is_some_and(|v| names.iter().any(|name| name == v)),
+            Self::Flag => value.is_boolean(),
+            Self::Text => value.is_string(),
+        }
+    }
+}
+
+impl std::fmt::Display for Range {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Number { min, max } => write!(f, "a number in [{min}, {max}]"),
+            Self::Choice(names) => write!(f, "one of {}", names.join(", ")),
+            Self::Flag => write!(f, "true or false"),
+            Self::Text => write!(f, "text"),
+        }
+    }
+}
+
+/// Reads the ranges out of the comments of the embedded file, which we write ourselves: two levels, two spaces each.
+pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
+    let mut group = String::new();
+    let mut ranges = BTreeMap::new();
+    for line in text.lines() {
+        let trimmed = line.trim_start();
+        let indent = line.len() - trimmed.len();
+        let Some((name, rest)) = trimmed.split_once(':') else {
+            continue;
+        };
+        if indent < 4 || trimmed.starts_with('#') {
+            continue;
+        }
+        let key = if indent == 4 {
+            name.to_owned()
+        } else {
+            format!("{group}.{name}")
+        };
+        match rest
+            .split_once(" # ")
+            .and_then(|(_, comment)| Range::of_comment(comment.trim()))
+        {
+            Some(range) => {
+                ranges.insert(key, range);
+            }
+            None => group = name.to_owned(),
+        }
+    }
+    ranges
+}

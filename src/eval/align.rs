@@ -1,0 +1,190 @@
+//! Two lists of poses of the same cameras in different frames -> the similarity between the frames.
+//!
+//! Knows nothing of time or files: pose i of one list belongs to pose i of the other.
+
+use glam::{DQuat, DVec3};
+use nalgebra::{Matrix3, Matrix4, SymmetricEigen};
+
+use crate::pose::{Rigid, Similarity};
+
+/// Spread across a path over spread along it, below which the positions are a line and say nothing of the roll
+/// about it. A car that drives straight for 60 m and wanders 30 cm is at 1e-2.
+const LINE_RATIO: f64 = 1e-3;
+
+/// Spread over distance from the origin below which all positions are one: rounding of the coordinates.
+const POINT_RATIO: f64 = 1e-12;
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Alignment {
+    pub reference_from_estimate: Similarity,
+    /// The positions lie on a line, so the orientations had to say how the path is rolled about it.
+    pub is_line: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum AlignError {
+    #[error("{found} poses in common, a similarity needs at least 3")]
+    TooFew { found: usize },
+    #[error("the positions of the {of} are all one point, so scale and heading are unknown")]
+    Point { of: &'static str },
+}
+
+/// Least squares over the positions (Umeyama 1991). Where they lie on a line the roll about it comes from the orientations.
+pub fn align(estimate: &[Rigid], reference: &[Rigid]) -> Result<Alignment, AlignError> {
+    assert_eq!(estimate.len(), reference.len(), "poses come in pairs");
+    if estimate.len() < 3 {
+        return Err(AlignError::TooFew {
+            found: estimate.len(),
+        });
+    }
+    let positions = |poses: &[Rigid]| {
+        poses
+            .iter()
+            .map(|pose| pose.translation)
+            .collect::<Vec<_>>()
+    };
+    let (source, target) = (positions(estimate), positions(reference));
+    let source_line = principal_axis(&source).ok_or(AlignError::Point { of: "run" })?;
+    let target_line = principal_axis(&target).ok_or(AlignError::Point { of: "reference" })?;
+    let similarity = umeyama(&source, &target).ok_or(AlignError::Point { of: "run" })?;
+
+    let is_line = source_line.ratio.min(target_line.ratio) < LINE_RATIO;
+    if !is_line {
+        return Ok(Alignment {
+            reference_from_estimate: similarity,
+            is_line,
+        });
+    }
+    // The list that is a line names the axis; seen from the reference.
+    let axis = if target_line.ratio <= source_line.ratio {
+        target_line.axis
+    } else {
+        similarity.rotation * source_line.axis
+    };
+    let roll = roll_about(axis, &similarity, estimate, reference);
+    let rotation = (roll * similarity.rotation).normalize();
+    let scale = similarity.scale;
+    let translation = mean(&target) - rotation * mean(&source) * scale;
+    Ok(Alignment {
+        reference_from_estimate: Similarity {
+            scale,
+            rotation,
+            translation,
+        },
+        is_line,
+    })
+}
+
+/// The similarity that takes `source` nearest to `target` in the sense of least squares: Umeyama's problem (1991,
+/// equations 34-43), with the rotation from Horn's quaternion (1987, section 4.A), which is never a reflection.
+/// `None` when either list is one point. Points on a line leave one turn about it open, which is then arbitrary.
+pub fn umeyama(source: &[DVec3], target: &[DVec3]) -> Option<Similarity> {
+    assert_eq!(source.len(), target.len(), "points come in pairs");
+    principal_axis(source)?;
+    principal_axis(target)?;
+    let (source_mean, target_mean) = (mean(source), mean(target));
+    let mut correlation = Matrix3::zeros();
+    let mut source_square = 0.0;
+    for (s, t) in source.iter().zip(target) {
+        let (s, t) = (*s - source_mean, *t - target_mean);
+        correlation += nalgebra::Vector3::from(s.to_array())
+            * nalgebra::Vector3::from(t.to_array()).transpose();
+        source_square += s.length_squared();
+    }
+    let (rotation, agreement) = best_rotation(&correlation);
+    // Horn's largest eigenvalue is the sum of target · rotation * source, which Umeyama calls tr(DS).
+    let scale = agreement / source_square;
+    if !(scale.is_finite() && scale > 0.0) {
+        return None;
+    }
+    Some(Similarity {
+        scale,
+        rotation,
+        translation: target_mean - rotation * source_mean * scale,
+    })
+}
+
+/// The rotation that maximises `sum(target · rotation * source)` for `correlation = sum(source targetᵀ)`, and that sum.
+fn best_rotation(correlation: &Matrix3<f64>) -> (DQuat, f64) {
+    let s = |row: usize, col: usize| correlation[(row, col)];
+    let n = Matrix4::new(
+        s(0, 0) + s(1, 1) + s(2, 2),
+        s(1, 2) - s(2, 1),
+        s(2, 0) - s(0, 2),
+        s(0, 1) - s(1, 0),
+        s(1, 2) - s(2, 1),
+        s(0, 0) - s(1, 1) - s(2, 2),
+        s(0, 1) + s(1, 0),
+        s(2, 0) + s(0, 2),
+        s(2, 0) - s(0, 2),
+        s(0, 1) + s(1, 0),
+        s(1, 1) - s(0, 0) - s(2, 2),
+        s(1, 2) + s(2, 1),
+        s(0, 1) - s(1, 0),
+        s(2, 0) + s(0, 2),
+        s(1, 2) + s(2, 1),
+        s(2, 2) - s(0, 0) - s(1, 1),
+    );
+    let eigen = SymmetricEigen::new(n);
+    let largest = eigen.eigenvalues.imax();
+    let q = eigen.eigenvectors.column(largest);
+    (
+        DQuat::from_xyzw(q[1], q[2], q[3], q[0]).normalize(),
+        eigen.eigenvalues[largest],
+    )
+}
+
+/// The turn about `axis` after which the orientations agree best: the twist part of the residual rotations,
+/// averaged as quaternions (the largest eigenvector of a 2x2 matrix, so the sign of each quaternion is of no matter).
+fn roll_about(
+    axis: DVec3,
+    similarity: &Similarity,
+    estimate: &[Rigid],
+    reference: &[Rigid],
+) -> DQuat {
+    let (mut ww, mut wv, mut vv) = (0.0, 0.0, 0.0);
+    for (e, r) in estimate.iter().zip(reference) {
+        let residual = r.rotation * (similarity.rotation * e.rotation).conjugate();
+        let (w, v) = (
+            residual.w,
+            DVec3::new(residual.x, residual.y, residual.z).dot(axis),
+        );
+        ww += w * w;
+        wv += w * v;
+        vv += v * v;
+    }
+    let half_angle = 0.5 * (2.0 * wv).atan2(ww - vv);
+    DQuat::from_axis_angle(axis, 2.0 * half_angle)
+}
+
+struct Axis {
+    axis: DVec3,
+    /// Second largest spread over the largest: 0 on a line, 1 in a disc or ball.
+    ratio: f64,
+}
+
+/// Direction of the largest spread; `None` when there is none.
+fn principal_axis(points: &[DVec3]) -> Option<Axis> {
+    let centre = mean(points);
+    let mut covariance = Matrix3::zeros();
+    for point in points {
+        let v = nalgebra::Vector3::from((*point - centre).to_array());
+        covariance += v * v.transpose();
+    }
+    let eigen = SymmetricEigen::new(covariance / points.len() as f64);
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+    let spread = |ix: usize| eigen.eigenvalues[order[ix]].max(0.0).sqrt();
+    if spread(0) <= POINT_RATIO * centre.length().max(f64::MIN_POSITIVE) {
+        return None;
+    }
+    let v = eigen.eigenvectors.column(order[0]);
+    Some(Axis {
+        axis: DVec3::new(v[0], v[1], v[2]).normalize(),
+        ratio: spread(1) / spread(0),
+    })
+}
+
+fn mean(points: &[DVec3]) -> DVec3 {
+    points.iter().sum::<DVec3>() / points.len().max(1) as f64
+}

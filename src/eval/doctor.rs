@@ -1,0 +1,398 @@
+//! What this machine has for splat-mapper, and for what is missing the line that fixes it.
+//!
+//! Looks at files, the environment and sockets only: it starts no GPU and changes nothing but one file that it removes.
+
+use std::net::{Ipv4Addr, UdpSocket};
+use std::path::{Path, PathBuf};
+
+use super::machine::{
+    cpu_features, entries, find_library, free_disk_mib, free_memory_mib, icd_files, library_folders,
+};
+
+/// A run over some hundred keyframes stays below this.
+const NEEDED_MEMORY_MIB: f64 = 2048.0;
+/// A run directory of a long recording, map and renders included.
+const NEEDED_DISK_MIB: f64 = 1024.0;
+/// Where zenoh looks for peers by default.
+const ZENOH_SCOUTING_GROUP: Ipv4Addr = Ipv4Addr::new(224, 0, 0, 224);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    Ok,
+    /// Works without; `found` says what it would be for.
+    Optional,
+    /// Mapping fails without.
+    Missing,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Check {
+    pub name: &'static str,
+    pub state: State,
+    pub found: String,
+    /// The line that mends it.
+    pub fix: Option<String>,
+}
+
+impl Check {
+    fn ok(name: &'static str, found: impl Into<String>) -> Self {
+        Self {
+            name,
+            state: State::Ok,
+            found: found.into(),
+            fix: None,
+        }
+    }
+
+    fn optional(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self {
+            name,
+            state: State::Optional,
+            found: found.into(),
+            fix: Some(fix.into()),
+        }
+    }
+
+    fn missing(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self {
+            name,
+            state: State::Missing,
+            found: found.into(),
+            fix: Some(fix.into()),
+        }
+    }
+}
+
+/// All checks, needed things first. Relative paths, such as `out/`, are meant from the current folder.
+pub fn doctor() -> Vec<Check> {
+    let here = Path::new(".");
+    let named_onnx_runtime = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
+    vec![
+        cpu(),
+        memory(free_memory_mib()),
+        write_access(here),
+        disk(free_disk_mib()),
+        vulkan_loader(&library_folders()),
+        vulkan_driver(&icd_files()),
+        ros2(std::env::var("ROS_DISTRO").ok(), Path::new("/opt/ros")),
+        cameras(Path::new("/dev")),
+        onnx_runtime(named_onnx_runtime, &library_folders()),
+        multicast(),
+    ]
+}
+
+/// One line a check and one a fix, and a last line with the verdict.
+pub fn format_checks(checks: &[Check]) -> String {
+    let width = checks
+        .iter()
+        .map(|check| check.name.len())
+        .max()
+        .unwrap_or_default();
+    let mut text = String::new();
+    for check in checks {
+        let mark = match check.state {
+            State::Ok => "ok      ",
+            State::Optional => "optional",
+            State::Missing => "MISSING ",
+        };
+        text.push_str(&format!("{mark}  {:width$}  {}\n", check.name, check.found));
+        if let Some(fix) = &check.fix {
+            text.push_str(&format!("          {:width$}  fix: {fix}\n", ""));
+        }
+    }
+    let n_missing = checks
+        .iter()
+        .filter(|check| check.state == State::Missing)
+        .count();
+    text.push_str(&match n_missing {
+        0 => "ready to map\n".to_owned(),
+        1 => "1 thing is missing\n".to_owned(),
+        n => format!("{n} things are missing\n"),
+    });
+    text
+}
+
+fn cpu() -> Check {
+    let n_threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let features = cpu_features();
+    let found = format!(
+        "{n_threads} threads, {}",
+        if features.is_empty() {
+            "no SIMD".to_owned()
+        } else {
+            features.join(" ")
+        }
+    );
+    if cfg!(target_arch = "x86_64") && !features.contains(&"avx2") {
+        return Check::optional(
+            "cpu",
+            format!("{found}; the cpu engine is several times slower"),
+            "use a CPU with AVX2 (since 2013), or a GPU",
+        );
+    }
+    Check::ok("cpu", found)
+}
+
+fn memory(free_mib: Option<f64>) -> Check {
+    match free_mib {
+        None => Check::ok("memory", "unknown (no /proc/meminfo)"),
+        Some(mib) if mib < NEEDED_MEMORY_MIB => Check::optional(
+            "memory",
+            format!("{mib:.0} MiB free; larger maps need {NEEDED_MEMORY_MIB:.0} MiB"),
+            "close other programs, or lower map.max_splats and source.max_side",
+        ),
+        Some(mib) => Check::ok("memory", format!("{:.1} GiB free", mib / 1024.0)),
+    }
+}
+
+fn write_access(folder: &Path) -> Check {
+    let probe = folder.join(format!(".splat-mapper-doctor-{}", std::process::id()));
+    let written = std::fs::write(&probe, b"x");
+    std::fs::remove_file(&probe).ok();
+    match written {
+        Ok(()) => Check::ok("write access", "the current folder is writable"),
+        Err(e) => Check::missing(
+            "write access",
+            format!("the current folder is not writable: {e}"),
+            "cd to a folder of yours, or name one with --out",
+        ),
+    }
+}
+
+fn disk(free_mib: Option<f64>) -> Check {
+    match free_mib {
+        None => Check::ok("disk", "unknown (df gave no answer)"),
+        Some(mib) if mib < NEEDED_DISK_MIB => Check::missing(
+            "disk",
+            format!("{mib:.0} MiB free here; a run needs up to {NEEDED_DISK_MIB:.0} MiB"),
+            "free some space, or name another place with --out",
+        ),
+        Some(mib) => Check::ok("disk", format!("{:.1} GiB free here", mib / 1024.0)),
+    }
+}
+
+fn vulkan_loader(folders: &[PathBuf]) -> Check {
+    match find_library(folders, "libvulkan.so.1") {
+        Some(path) => Check::ok("vulkan", path.display().to_string()),
+        None => Check::optional(
+            "vulkan",
+            "no libvulkan.so.1; needed for --backend wgpu, else the cpu engine maps",
+            "sudo apt install libvulkan1",
+        ),
+    }
+}
+
+fn vulkan_driver(icd_files: &[PathBuf]) -> Check {
+    let name = |path: &PathBuf| {
+        path.file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
+    };
+    let names: Vec<String> = icd_files.iter().map(name).collect();
+    let is_software = |name: &String| {
+        name.contains("lvp") || name.contains("swrast") || name.contains("swiftshader")
+    };
+    if names.is_empty() {
+        let fix = "sudo apt install mesa-vulkan-drivers (AMD, Intel, tests) or the driver of the GPU's maker";
+        return Check::optional(
+            "vulkan driver",
+            "none; needed for --backend wgpu and for the shader tests",
+            fix,
+        );
+    }
+    if names.iter().all(is_software) {
+        let found = format!(
+            "software only ({}): enough for the shader tests, the cpu engine maps",
+            names.join(", ")
+        );
+        return Check::optional(
+            "vulkan driver",
+            found,
+            "on a machine with a GPU, install the driver of its maker",
+        );
+    }
+    Check::ok("vulkan driver", names.join(", "))
+}
+
+fn ros2(distro: Option<String>, root: &Path) -> Check {
+    if let Some(distro) = distro.filter(|distro| !distro.is_empty()) {
+        return Check::ok("ros 2", format!("{distro} is sourced"));
+    }
+    match entries(root).first() {
+        Some(installed) => Check::optional(
+            "ros 2",
+            "installed, not sourced; needed for ros2: sources and topics",
+            format!("source {}/setup.bash", installed.display()),
+        ),
+        None => Check::optional(
+            "ros 2",
+            "none; needed for ros2: sources and topics only, recordings and zenoh work without",
+            "install a ROS 2 distribution (docs.ros.org) and source its setup.bash",
+        ),
+    }
+}
+
+fn cameras(dev: &Path) -> Check {
+    let is_video = |path: &PathBuf| {
+        path.file_name()
+            .is_some_and(|name| name.to_string_lossy().starts_with("video"))
+    };
+    let devices: Vec<PathBuf> = entries(dev).into_iter().filter(is_video).collect();
+    if devices.is_empty() {
+        let fix = "plug a camera in; in a container, pass it on with --device /dev/video0";
+        return Check::optional(
+            "camera",
+            "no /dev/video*; needed for v4l2: and webcam: sources",
+            fix,
+        );
+    }
+    let (readable, locked): (Vec<_>, Vec<_>) = devices
+        .iter()
+        .partition(|path| std::fs::File::open(path).is_ok());
+    let names = |paths: &[&PathBuf]| {
+        paths
+            .iter()
+            .map(|path| path.display().to_string())
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    if readable.is_empty() {
+        let found = format!("{} cannot be opened", names(&locked));
+        return Check::optional(
+            "camera",
+            found,
+            "sudo usermod -aG video $USER, then log in again",
+        );
+    }
+    Check::ok("camera", names(&readable))
+}
+
+fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
+    const FIX: &str = "pip install onnxruntime, then export ORT_DYLIB_PATH=<site-packages>/onnxruntime/capi/libonnxruntime.so.<version>";
+    if let Some(path) = named {
+        return if path.is_file() {
+            Check::ok("onnx runtime", path.display().to_string())
+        } else {
+            Check::optional(
+                "onnx runtime",
+                format!("ORT_DYLIB_PATH names no file: {}", path.display()),
+                FIX,
+            )
+        };
+    }
+    match find_library(folders, "libonnxruntime.so") {
+        Some(path) => Check::ok("onnx runtime", path.display().to_string()),
+        None => Check::optional(
+            "onnx runtime",
+            "none; needed for --geometry onnx:FILE, sfm works without",
+            FIX,
+        ),
+    }
+}
+
+/// Joins zenoh's scouting group and leaves it again; nothing is sent.
+fn multicast() -> Check {
+    let joined = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))
+        .and_then(|socket| socket.join_multicast_v4(&ZENOH_SCOUTING_GROUP, &Ipv4Addr::UNSPECIFIED));
+    match joined {
+        Ok(()) => Check::ok(
+            "multicast",
+            format!("{ZENOH_SCOUTING_GROUP} joined: zenoh peers find each other"),
+        ),
+        Err(e) => Check::optional(
+            "multicast",
+            format!("{ZENOH_SCOUTING_GROUP} refused ({e}); zenoh cannot find peers by itself"),
+            "--set publish.zenoh_connect=tcp/HOST:7447",
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn too_little_disk_is_a_fault_too_little_memory_a_warning() {
+        assert_eq!(
+            (
+                disk(Some(1.0)).state,
+                disk(Some(2048.0)).state,
+                disk(None).state
+            ),
+            (State::Missing, State::Ok, State::Ok)
+        );
+        assert_eq!(
+            (
+                memory(Some(1.0)).state,
+                memory(Some(8192.0)).state,
+                memory(None).state
+            ),
+            (State::Optional, State::Ok, State::Ok)
+        );
+    }
+
+    #[test]
+    fn software_vulkan_alone_is_no_gpu() {
+        let check = |names: &[&str]| {
+            vulkan_driver(&names.iter().map(PathBuf::from).collect::<Vec<_>>()).state
+        };
+        assert_eq!(check(&[]), State::Optional);
+        assert_eq!(check(&["/x/lvp_icd.x86_64.json"]), State::Optional);
+        assert_eq!(
+            check(&["/x/lvp_icd.x86_64.json", "/x/radeon_icd.x86_64.json"]),
+            State::Ok
+        );
+    }
+
+    #[test]
+    fn libraries_are_found_by_name_or_version_but_not_by_prefix() {
+        let folder = tempfile::tempdir().unwrap();
+        let folders = [folder.path().to_owned()];
+        std::fs::write(folder.path().join("libvulkan.so.10"), "").unwrap();
+        std::fs::write(folder.path().join("libonnxruntime.so.1.31.1"), "").unwrap();
+        assert_eq!(vulkan_loader(&folders).state, State::Optional);
+        assert_eq!(onnx_runtime(None, &folders).state, State::Ok);
+        std::fs::write(folder.path().join("libvulkan.so.1"), "").unwrap();
+        assert_eq!(vulkan_loader(&folders).state, State::Ok);
+        assert_eq!(
+            onnx_runtime(Some(folder.path().join("gone.so")), &folders).state,
+            State::Optional
+        );
+    }
+
+    #[test]
+    fn an_installed_ros_is_named_with_its_line_to_source() {
+        let root = tempfile::tempdir().unwrap();
+        assert!(ros2(None, root.path()).found.starts_with("none"));
+        std::fs::create_dir(root.path().join("jazzy")).unwrap();
+        let fix = ros2(None, root.path()).fix.unwrap();
+        assert!(
+            fix.starts_with("source ") && fix.ends_with("jazzy/setup.bash"),
+            "{fix}"
+        );
+        assert_eq!(ros2(Some("jazzy".to_owned()), root.path()).state, State::Ok);
+    }
+
+    #[test]
+    fn no_write_access_is_a_fault_with_a_fix() {
+        let check = write_access(Path::new("/nowhere/at/all"));
+        assert_eq!(check.state, State::Missing);
+        let text = format_checks(&[check, Check::ok("cpu", "2 threads")]);
+        assert!(
+            text.contains("MISSING ")
+                && text.contains("fix: ")
+                && text.ends_with("1 thing is missing\n"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn this_machine_can_be_examined() {
+        let checks = doctor();
+        for check in &checks {
+            assert_eq!(check.state == State::Ok, check.fix.is_none(), "{check:?}");
+        }
+        assert!(format_checks(&checks).lines().count() > checks.len());
+    }
+}

@@ -1,0 +1,261 @@
+//! A run directory and a reference trajectory -> the figures of `splat-mapper eval`.
+//!
+//! Keyframes only; positions are compared after one Sim(3) alignment, in the unit of the reference.
+
+use std::path::Path;
+
+use glam::DVec3;
+use serde::Serialize;
+
+use super::EvalError;
+use super::align::{AlignError, align};
+use super::report::{Quality, Report};
+use super::trajectory::{
+    TOLERANCE_SECS, TimedPose, associate, read_tum, shifted, stamp_offset_nanos,
+};
+use crate::pose::Rigid;
+
+/// What `eval --json` prints. A figure that has no value is null and `note` says why.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Evaluation {
+    /// Keyframes of the run that have a reference pose: what all figures are over.
+    pub registered: usize,
+    /// Poses of the reference.
+    pub reference: usize,
+    /// Root mean square distance of positions after alignment, in units of the reference.
+    pub ate_rmse: Option<f64>,
+    /// The same as a share of the largest distance between two reference positions.
+    pub ate_percent_of_extent: Option<f64>,
+    /// Mean angle between orientations after the same alignment.
+    pub rotation_mean_deg: Option<f64>,
+    /// Root mean square error of the motion from each keyframe to the next: its length, in units of the reference,
+    pub rpe_translation: Option<f64>,
+    /// and its angle.
+    pub rpe_rotation_deg: Option<f64>,
+    /// Units of the reference per unit of the run.
+    pub aligned_scale: Option<f64>,
+    /// Poses in the run's `keyframes.tum`.
+    pub keyframes: usize,
+    /// What a reader must know before quoting the figures.
+    pub note: Option<String>,
+    /// Held-out views, from the run's `report.json` where there is one.
+    pub quality: Option<Quality>,
+}
+
+/// Compares `RUN_DIR/keyframes.tum` with a reference in TUM form.
+pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalError> {
+    let keyframes_path = run_dir.join("keyframes.tum");
+    let keyframes = read_poses(&keyframes_path)?;
+    let truth = read_poses(reference)?;
+    let report_path = run_dir.join("report.json");
+    let quality = if report_path.exists() {
+        Some(Report::read(&report_path)?.quality)
+    } else {
+        None
+    };
+    let evaluation = compare(&keyframes, &truth);
+    if evaluation.registered == 0 {
+        return Err(EvalError::NothingInCommon {
+            run: span(&keyframes),
+            reference: span(&truth),
+            tolerance_secs: TOLERANCE_SECS,
+            path: reference.to_owned(),
+        });
+    }
+    Ok(Evaluation {
+        quality,
+        ..evaluation
+    })
+}
+
+/// The figures for two trajectories in order of time.
+pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
+    let offset_nanos = stamp_offset_nanos(keyframes, reference, TOLERANCE_SECS);
+    let keyframes = &shifted(keyframes, offset_nanos)[..];
+    let pairs = associate(keyframes, reference, TOLERANCE_SECS);
+    let estimated: Vec<Rigid> = pairs.iter().map(|&(ix, _)| keyframes[ix].pose).collect();
+    let truth: Vec<Rigid> = pairs.iter().map(|&(_, ix)| reference[ix].pose).collect();
+    let empty = Evaluation {
+        registered: pairs.len(),
+        reference: reference.len(),
+        ate_rmse: None,
+        ate_percent_of_extent: None,
+        rotation_mean_deg: None,
+        rpe_translation: None,
+        rpe_rotation_deg: None,
+        aligned_scale: None,
+        keyframes: keyframes.len(),
+        note: shift_note(offset_nanos),
+        quality: None,
+    };
+    let alignment = match align(&estimated, &truth) {
+        Ok(alignment) => alignment,
+        Err(reason) => {
+            return Evaluation {
+                note: Some(note_of(reason)),
+                ..empty
+            };
+        }
+    };
+    let similarity = alignment.reference_from_estimate;
+    let aligned: Vec<Rigid> = estimated
+        .iter()
+        .map(|pose| similarity.transform_pose(pose))
+        .collect();
+    let ate = rmse(
+        aligned
+            .iter()
+            .zip(&truth)
+            .map(|(a, t)| a.translation.distance(t.translation)),
+    );
+    let positions: Vec<DVec3> = reference
+        .iter()
+        .map(|timed| timed.pose.translation)
+        .collect();
+    let angles = aligned
+        .iter()
+        .zip(&truth)
+        .map(|(a, t)| a.angle_to(t).to_degrees());
+    let motion_errors: Vec<Rigid> = aligned
+        .windows(2)
+        .zip(truth.windows(2))
+        .map(|(a, t)| (t[0].inverse() * t[1]).inverse() * (a[0].inverse() * a[1]))
+        .collect();
+    Evaluation {
+        ate_rmse: Some(ate),
+        ate_percent_of_extent: Some(100.0 * ate / extent(&positions)),
+        rotation_mean_deg: Some(angles.sum::<f64>() / aligned.len() as f64),
+        rpe_translation: Some(rmse(motion_errors.iter().map(|error| error.translation.length()))),
+        rpe_rotation_deg: Some(rmse(motion_errors.iter().map(|error| error.angle_to(&Rigid::IDENTITY).to_degrees()))),
+        aligned_scale: Some(similarity.scale),
+        note: join_notes(shift_note(offset_nanos), alignment.is_line.then(|| {
+            "the positions lie on a line: the roll about it was aligned by the orientations, so rotation_mean_deg leaves that part out".to_owned()
+        })),
+        ..empty
+    }
+}
+
+fn shift_note(offset_nanos: i64) -> Option<String> {
+    let secs = offset_nanos / 1_000_000_000;
+    (secs != 0).then(|| format!("the stamps of the run were shifted by {secs} s to meet the reference"))
+}
+
+fn join_notes(first: Option<String>, second: Option<String>) -> Option<String> {
+    let notes: Vec<String> = first.into_iter().chain(second).collect();
+    (!notes.is_empty()).then(|| notes.join("; "))
+}
+
+/// The largest distance between two points. Exact up to some thousand points; beyond, at most 0.5 % too small.
+pub fn extent(points: &[DVec3]) -> f64 {
+    const MAX_EXACT: usize = 4000;
+    const N_DIRECTIONS: usize = 512;
+
+    let longest = |points: &[DVec3]| {
+        let pairs = points
+            .iter()
+            .enumerate()
+            .flat_map(|(ix, a)| points[ix + 1..].iter().map(move |b| a.distance_squared(*b)));
+        pairs.fold(0.0, f64::max).sqrt()
+    };
+    if points.len() <= MAX_EXACT {
+        return longest(points);
+    }
+    // The two ends of the longest distance are nearly outermost along one of many even directions: no direction
+    // is further than 0.1 rad from a spiral point of the half sphere, and cos(0.1) = 0.995.
+    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let outermost: Vec<DVec3> = (0..N_DIRECTIONS)
+        .flat_map(|ix| {
+            let z = (ix as f64 + 0.5) / N_DIRECTIONS as f64;
+            let (sin, cos) = (golden_angle * ix as f64).sin_cos();
+            let radius = (1.0 - z * z).sqrt();
+            let direction = DVec3::new(radius * cos, radius * sin, z);
+            let along = |a: &&DVec3, b: &&DVec3| a.dot(direction).total_cmp(&b.dot(direction));
+            [points.iter().min_by(along), points.iter().max_by(along)]
+                .into_iter()
+                .flatten()
+                .copied()
+        })
+        .collect();
+    longest(&outermost)
+}
+
+/// For people: one figure a line.
+impl std::fmt::Display for Evaluation {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let figure =
+            |value: Option<f64>| value.map_or_else(|| "none".to_owned(), |v| format!("{v:.4}"));
+        writeln!(
+            f,
+            "registered       {} of {} reference poses ({} keyframes in the run)",
+            self.registered, self.reference, self.keyframes
+        )?;
+        writeln!(
+            f,
+            "ATE              {} RMSE, {} % of the extent (keyframes, Sim(3) aligned, units of the reference)",
+            figure(self.ate_rmse),
+            figure(self.ate_percent_of_extent)
+        )?;
+        writeln!(
+            f,
+            "rotation         {} deg mean",
+            figure(self.rotation_mean_deg)
+        )?;
+        writeln!(
+            f,
+            "RPE              {} and {} deg RMSE, keyframe to keyframe",
+            figure(self.rpe_translation),
+            figure(self.rpe_rotation_deg)
+        )?;
+        writeln!(
+            f,
+            "aligned scale    {} units of the reference per unit of the run",
+            figure(self.aligned_scale)
+        )?;
+        if let Some(quality) = &self.quality {
+            if quality.holdout_every > 0 {
+                writeln!(
+                    f,
+                    "held-out views   PSNR {} dB, SSIM {} (every {}th keyframe)",
+                    figure(quality.psnr_holdout),
+                    figure(quality.ssim_holdout),
+                    quality.holdout_every
+                )?;
+            }
+            writeln!(f, "training views   PSNR {} dB", figure(quality.psnr_train))?;
+        }
+        if let Some(note) = &self.note {
+            writeln!(f, "note             {note}")?;
+        }
+        Ok(())
+    }
+}
+
+fn read_poses(path: &Path) -> Result<Vec<TimedPose>, EvalError> {
+    let poses = read_tum(path)?;
+    if poses.is_empty() {
+        Err(EvalError::NoPoses {
+            path: path.to_owned(),
+        })
+    } else {
+        Ok(poses)
+    }
+}
+
+fn note_of(reason: AlignError) -> String {
+    format!("the trajectories cannot be aligned: {reason}")
+}
+
+fn span(poses: &[TimedPose]) -> String {
+    match poses {
+        [] => "none".to_owned(),
+        [first, .., last] => format!("{} to {}", first.stamp, last.stamp),
+        [only] => only.stamp.to_string(),
+    }
+}
+
+fn rmse(errors: impl Iterator<Item = f64>) -> f64 {
+    let (sum, n) = errors.fold((0.0, 0usize), |(sum, n), error| {
+        (sum + error * error, n + 1)
+    });
+    (sum / n.max(1) as f64).sqrt()
+}

@@ -1,0 +1,168 @@
+//! Looking at the machine: files, folders, the environment. Knows nothing of what is good or bad.
+
+use std::path::{Path, PathBuf};
+
+#[cfg(target_arch = "x86_64")]
+pub fn cpu_features() -> Vec<&'static str> {
+    let has = [
+        ("sse4.2", std::arch::is_x86_feature_detected!("sse4.2")),
+        ("avx2", std::arch::is_x86_feature_detected!("avx2")),
+        ("fma", std::arch::is_x86_feature_detected!("fma")),
+        ("avx512f", std::arch::is_x86_feature_detected!("avx512f")),
+    ];
+    has.into_iter()
+        .filter_map(|(name, is_there)| is_there.then_some(name))
+        .collect()
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+pub fn cpu_features() -> Vec<&'static str> {
+    if cfg!(target_feature = "neon") {
+        vec!["neon"]
+    } else {
+        Vec::new()
+    }
+}
+
+pub fn library_folders() -> Vec<PathBuf> {
+    const STANDARD: [&str; 9] = [
+        "/usr/local/lib",
+        "/usr/lib/x86_64-linux-gnu",
+        "/usr/lib/aarch64-linux-gnu",
+        "/usr/lib64",
+        "/usr/lib",
+        "/lib/x86_64-linux-gnu",
+        "/lib/aarch64-linux-gnu",
+        "/lib64",
+        "/lib",
+    ];
+    let named = std::env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
+    std::env::split_paths(&named)
+        .filter(|path| !path.as_os_str().is_empty())
+        .chain(STANDARD.map(PathBuf::from))
+        .collect()
+}
+
+/// The library itself or a versioned name of it.
+pub fn find_library(folders: &[PathBuf], name: &str) -> Option<PathBuf> {
+    let matches = |path: &PathBuf| {
+        let file = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
+        file.strip_prefix(name)
+            .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    folders
+        .iter()
+        .find_map(|folder| entries(folder).into_iter().find(matches))
+}
+
+/// Vulkan's driver manifests, where its loader looks for them.
+pub fn icd_files() -> Vec<PathBuf> {
+    let named =
+        std::env::var_os("VK_DRIVER_FILES").or_else(|| std::env::var_os("VK_ICD_FILENAMES"));
+    if let Some(named) = named {
+        return std::env::split_paths(&named)
+            .filter(|path| path.is_file())
+            .collect();
+    }
+    let folders = ["/usr/local/etc", "/usr/local/share", "/etc", "/usr/share"].map(PathBuf::from);
+    let home = std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".local/share"));
+    let is_manifest = |path: &PathBuf| {
+        path.extension()
+            .is_some_and(|extension| extension == "json")
+    };
+    folders
+        .into_iter()
+        .chain(home)
+        .flat_map(|folder| entries(&folder.join("vulkan/icd.d")))
+        .filter(is_manifest)
+        .collect()
+}
+
+/// Sorted content of a folder; nothing when it is not there.
+pub fn entries(folder: &Path) -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path())
+        .collect();
+    paths.sort();
+    paths
+}
+
+/// Of the machine, or of the container where that has less.
+pub fn free_memory_mib() -> Option<f64> {
+    let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
+    free_memory_of(
+        &read("/proc/meminfo"),
+        &read("/sys/fs/cgroup/memory.max"),
+        &read("/sys/fs/cgroup/memory.current"),
+    )
+}
+
+/// In the current folder, as `df` says: the standard library does not know.
+pub fn free_disk_mib() -> Option<f64> {
+    let output = std::process::Command::new("df")
+        .args(["-Pk", "."])
+        .output()
+        .ok()?;
+    free_disk_of(&String::from_utf8_lossy(&output.stdout))
+}
+
+fn free_memory_of(meminfo: &str, cgroup_max: &str, cgroup_used: &str) -> Option<f64> {
+    let line = meminfo
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let available_kib: f64 = line.split_ascii_whitespace().next()?.parse().ok()?;
+    // The file holds `max` where the container has no limit.
+    let bytes = |text: &str| text.trim().parse::<f64>().ok();
+    let in_container_kib = bytes(cgroup_max)
+        .zip(bytes(cgroup_used))
+        .map(|(max, used)| (max - used).max(0.0) / 1024.0);
+    Some(in_container_kib.map_or(available_kib, |limit| limit.min(available_kib)) / 1024.0)
+}
+
+/// Last line of `df -Pk`: device, size, used, available in KiB.
+fn free_disk_of(df: &str) -> Option<f64> {
+    let available_kib: f64 = df
+        .lines()
+        .last()?
+        .split_ascii_whitespace()
+        .nth(3)?
+        .parse()
+        .ok()?;
+    Some(available_kib / 1024.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_is_that_of_the_container_when_less() {
+        let meminfo = "MemTotal:  16000000 kB\nMemAvailable:  8388608 kB\n";
+        assert_eq!(free_memory_of(meminfo, "max\n", "5"), Some(8192.0));
+        assert_eq!(free_memory_of(meminfo, "4294967296\n", "0\n"), Some(4096.0));
+        assert_eq!(
+            free_memory_of(meminfo, "1073741824", "536870912"),
+            Some(512.0)
+        );
+        assert_eq!(free_memory_of(meminfo, "5", "7"), Some(0.0));
+        assert_eq!(free_memory_of("", "", ""), None);
+    }
+
+    #[test]
+    fn disk_space_is_the_fourth_column() {
+        let df =
+            "Filesystem 1024-blocks Used Available Capacity Mounted on\noverlay 1 2 2097152 4% /\n";
+        assert_eq!(free_disk_of(df), Some(2048.0));
+        assert_eq!(
+            (free_disk_of(""), free_disk_of("df: no such file")),
+            (None, None)
+        );
+    }
+}

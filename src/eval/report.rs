@@ -1,0 +1,258 @@
+//! `report.json`: what a run did, in numbers. Keys may be added, never renamed or removed: scripts depend on them.
+//!
+//! A figure that has no value is null. Units are in the names.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+use super::{EvalError, read_text, write_atomically};
+use crate::map::snapshot::ScaleSource;
+use crate::source::SourceCounts;
+
+const MAX_FILE_BYTES: u64 = 1 << 26;
+
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// Of the program that wrote this.
+    #[serde(default)]
+    pub version: String,
+    pub frames: FrameCounts,
+    pub keyframes: KeyframeCounts,
+    pub splats: u64,
+    pub steps: u64,
+    pub adapter: String,
+    pub seed: u64,
+    /// Of `map.ply`, in hexadecimal; empty when there is no map.
+    pub map_sha256: String,
+    pub timing_s: Timing,
+    pub steps_per_s: Option<f64>,
+    pub latency_ms: Latency,
+    pub peak_rss_mib: Option<f64>,
+    pub peak_gpu_mib: Option<f64>,
+    pub quality: Quality,
+    pub scale: Scale,
+    /// Why the input ended early.
+    #[serde(default)]
+    pub source_fault: Option<String>,
+    /// Why keyframes are missing.
+    #[serde(default)]
+    pub geometry_note: Option<String>,
+    /// Why the run failed; the other figures are those up to then.
+    #[serde(default)]
+    pub error: Option<String>,
+    /// All of `launch/params.yaml` as the run used them.
+    #[serde(default)]
+    pub parameters: BTreeMap<String, serde_json::Value>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameCounts {
+    pub received: u64,
+    pub dropped: u64,
+    pub undecodable: u64,
+    pub out_of_order: u64,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeyframeCounts {
+    pub selected: u64,
+    /// With a pose in the map.
+    pub registered: u64,
+    /// Groups of keyframes whose relation to each other is unknown; the map is the largest.
+    pub components: u64,
+}
+
+/// Seconds of work by stage; stages overlap, so they need not add up to `wall`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Timing {
+    #[serde(deserialize_with = "null_as_nan")]
+    pub wall: f64,
+    #[serde(deserialize_with = "null_as_nan")]
+    pub decode: f64,
+    #[serde(deserialize_with = "null_as_nan")]
+    pub geometry: f64,
+    #[serde(deserialize_with = "null_as_nan")]
+    pub optimise: f64,
+}
+
+/// From the arrival of a keyframe to its pose, and to the first snapshot that holds it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Latency {
+    pub keyframe_to_pose_p50: Option<f64>,
+    pub keyframe_to_pose_p95: Option<f64>,
+    pub keyframe_to_snapshot_p50: Option<f64>,
+    pub keyframe_to_snapshot_p95: Option<f64>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Quality {
+    /// Every n-th keyframe was kept out of optimisation; 0 = none.
+    pub holdout_every: u64,
+    pub psnr_train: Option<f64>,
+    pub psnr_holdout: Option<f64>,
+    pub ssim_holdout: Option<f64>,
+    /// Needs a trained network, so mostly null.
+    pub lpips_holdout: Option<f64>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Scale {
+    /// `up_to_scale` or `given`.
+    pub source: String,
+    pub metres_per_unit: Option<f64>,
+    /// Standard deviation of `metres_per_unit`.
+    pub std: Option<f64>,
+}
+
+impl Report {
+    pub fn write(&self, path: &Path) -> Result<(), EvalError> {
+        let mut text = serde_json::to_string_pretty(self)
+            .map_err(|e| EvalError::writing("the report", &e, path))?;
+        text.push('\n');
+        write_atomically("the report", text.as_bytes(), path)
+    }
+
+    pub fn read(path: &Path) -> Result<Self, EvalError> {
+        let text = read_text("the report", MAX_FILE_BYTES, path)?;
+        serde_json::from_str(&text).map_err(|e| EvalError::reading("the report", &e, path))
+    }
+}
+
+impl FrameCounts {
+    /// `dropped` comes from the first queue, the rest from the source.
+    pub fn of(counts: &SourceCounts, dropped: u64) -> Self {
+        let SourceCounts {
+            received,
+            undecodable,
+            out_of_order,
+            ..
+        } = *counts;
+        Self {
+            received,
+            dropped,
+            undecodable,
+            out_of_order,
+        }
+    }
+}
+
+impl Latency {
+    /// From one measurement, in seconds, per keyframe.
+    pub fn of(keyframe_to_pose_secs: &[f64], keyframe_to_snapshot_secs: &[f64]) -> Self {
+        let ms = |values: &[f64], share: f64| percentile(values, share).map(|secs| secs * 1e3);
+        Self {
+            keyframe_to_pose_p50: ms(keyframe_to_pose_secs, 0.5),
+            keyframe_to_pose_p95: ms(keyframe_to_pose_secs, 0.95),
+            keyframe_to_snapshot_p50: ms(keyframe_to_snapshot_secs, 0.5),
+            keyframe_to_snapshot_p95: ms(keyframe_to_snapshot_secs, 0.95),
+        }
+    }
+}
+
+impl Scale {
+    pub fn of(source: ScaleSource) -> Self {
+        match source {
+            ScaleSource::UpToScale => Self {
+                source: "up_to_scale".to_owned(),
+                metres_per_unit: None,
+                std: None,
+            },
+            ScaleSource::Given => Self {
+                source: "given".to_owned(),
+                metres_per_unit: Some(1.0),
+                std: None,
+            },
+        }
+    }
+}
+
+impl Default for Scale {
+    fn default() -> Self {
+        Self::of(ScaleSource::UpToScale)
+    }
+}
+
+/// Value below which `share` (0 to 1) of the finite values lie, between two of them by proportion. `None` of none.
+pub fn percentile(values: &[f64], share: f64) -> Option<f64> {
+    let mut sorted: Vec<f64> = values
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    let place = share.clamp(0.0, 1.0) * last as f64;
+    let (below, above) = (
+        sorted[place.floor() as usize],
+        sorted[place.ceil() as usize],
+    );
+    Some(below + (above - below) * place.fract())
+}
+
+/// The most memory this process ever had, where the system tells (Linux).
+pub fn peak_rss_mib() -> Option<f64> {
+    peak_of_status(&std::fs::read_to_string("/proc/self/status").ok()?)
+}
+
+/// SHA-256 in hexadecimal.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    use sha2::Digest;
+
+    sha2::Sha256::digest(bytes)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
+
+fn peak_of_status(status: &str) -> Option<f64> {
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib / 1024.0)
+}
+
+/// JSON has no NaN: it is written as null, and so must be read back.
+fn null_as_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_lie_between_the_values() {
+        let values = [4.0, 1.0, f64::NAN, 3.0, 2.0, 5.0];
+        assert_eq!(percentile(&values, 0.5), Some(3.0));
+        assert_eq!(percentile(&values, 0.95), Some(4.8));
+        assert_eq!(
+            (percentile(&values, 0.0), percentile(&values, 1.0)),
+            (Some(1.0), Some(5.0))
+        );
+        assert_eq!(
+            (percentile(&[], 0.5), percentile(&[7.0], 0.95)),
+            (None, Some(7.0))
+        );
+    }
+
+    #[test]
+    fn peak_memory_is_read_from_the_status_file() {
+        assert_eq!(
+            peak_of_status("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 1 kB\n"),
+            Some(2.0)
+        );
+        assert_eq!(peak_of_status("Name:\tx\n"), None);
+        assert_eq!(peak_of_status("VmHWM:\t many kB\n"), None);
+    }
+
+    #[test]
+    fn the_hash_is_the_published_one_of_abc() {
+        assert_eq!(
+            sha256_hex(b"abc"),
+            "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+        );
+    }
+}

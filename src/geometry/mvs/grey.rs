@@ -1,0 +1,86 @@
+//! A colour picture -> luma at the size of the depth map, by area averaging.
+
+use crate::config::MvsParams;
+use crate::frame::RgbImage;
+
+/// Luma from -0.5 to 0.5: centred, so that sums of squares keep their digits.
+#[derive(Debug, Clone)]
+pub(super) struct Grey {
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) values: Vec<f32>,
+}
+
+/// Cells of the cost volume, 7 bytes each, that one sweep may take: larger settings get a smaller picture.
+const MAX_CELLS: usize = 1 << 27;
+
+/// Rec. 601 luma.
+const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
+
+impl Grey {
+    /// A picture whose pixels do not fit its size counts as empty.
+    pub(super) fn of_image(image: &RgbImage, params: &MvsParams) -> Self {
+        let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
+        let fits = from_width.checked_mul(from_height).and_then(|n| n.checked_mul(3)) == Some(image.pixels.len());
+        if !fits || image.pixels.is_empty() {
+            return Self { width: 0, height: 0, values: Vec::new() };
+        }
+        let (width, height) = working_size(from_width, from_height, params);
+        let columns = shares(from_width, width);
+        let rows = shares(from_height, height);
+        let mut luma = vec![0.0_f32; from_width];
+        let mut values = vec![0.0_f32; width * height];
+        for (y, row) in rows.iter().enumerate() {
+            let into = &mut values[y * width..(y + 1) * width];
+            for (from_y, share_y) in row.cells() {
+                let pixels = &image.pixels[3 * from_y * from_width..3 * (from_y + 1) * from_width];
+                for (value, rgb) in luma.iter_mut().zip(pixels.chunks_exact(3)) {
+                    *value = rgb.iter().zip(LUMA).map(|(&c, weight)| f32::from(c) * weight).sum();
+                }
+                for (value, column) in into.iter_mut().zip(&columns) {
+                    let sum: f32 = column.cells().map(|(from_x, share_x)| share_x * luma[from_x]).sum();
+                    *value += share_y * sum;
+                }
+            }
+            for value in into {
+                *value = *value / 255.0 - 0.5;
+            }
+        }
+        Self { width, height, values }
+    }
+
+    pub(super) fn row(&self, y: usize) -> &[f32] {
+        &self.values[y * self.width..(y + 1) * self.width]
+    }
+}
+
+/// Never larger than the picture, longer side at most `params.max_side`.
+fn working_size(width: usize, height: usize, params: &MvsParams) -> (usize, usize) {
+    let (w, h) = (width as f64, height as f64);
+    let by_side = f64::from(params.max_side) / w.max(h);
+    let by_memory = (MAX_CELLS as f64 / (w * h * params.n_depths.max(1) as f64)).sqrt();
+    let scale = by_side.min(by_memory).min(1.0);
+    ((w * scale).round().max(1.0) as usize, (h * scale).round().max(1.0) as usize)
+}
+
+/// The stretch of old pixels under one new pixel.
+struct Share {
+    from: f64,
+    to: f64,
+}
+
+impl Share {
+    /// Old pixel and its share; the shares add up to 1.
+    fn cells(&self) -> impl Iterator<Item = (usize, f32)> + '_ {
+        let last = (self.to.ceil() as usize).max(self.from as usize + 1);
+        (self.from as usize..last).map(|ix| {
+            let overlap = self.to.min(ix as f64 + 1.0) - self.from.max(ix as f64);
+            (ix, (overlap / (self.to - self.from)) as f32)
+        })
+    }
+}
+
+fn shares(from: usize, into: usize) -> Vec<Share> {
+    let edge = |ix: usize| ix as f64 * from as f64 / into as f64;
+    (0..into).map(|ix| Share { from: edge(ix), to: edge(ix + 1).min(from as f64) }).collect()
+}

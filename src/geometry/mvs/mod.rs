@@ -1,0 +1,108 @@
+//! Posed pictures -> dense depth: plane sweep with ZNCC, semi-global matching, cross-view verification.
+//!
+//! Knows nothing of how the poses came about. Lengths are in whatever unit the poses use.
+
+mod consistency;
+mod grey;
+pub mod neighbours;
+mod sgm;
+pub mod state;
+mod sweep;
+
+use std::sync::Arc;
+
+use crate::camera::Intrinsics;
+use crate::config::MvsParams;
+use crate::frame::{DepthMap, RgbImage};
+use crate::pose::Rigid;
+
+/// A picture and where it was taken from.
+#[derive(Debug, Clone)]
+pub struct MvsView {
+    pub image: Arc<RgbImage>,
+    /// May be stated for another size of the same picture.
+    pub intrinsics: Intrinsics,
+    pub world_from_cam: Rigid,
+}
+
+/// Depth of one view before any other view has confirmed it. Not to be shown or mapped.
+#[derive(Debug, Clone)]
+pub struct RawDepth {
+    /// Of the depth map, not of the picture that it was made from.
+    pub intrinsics: Intrinsics,
+    /// z-depth; 0 = no value.
+    pub depth: Vec<f32>,
+    /// ZNCC of the depth's plane, 0 to 1.
+    pub score: Vec<f32>,
+    /// How far the best plane stands out from the second best, 0 to 1.
+    pub margin: Vec<f32>,
+}
+
+/// Depth of `reference` by matching it against `sources`, between the planes `near` and `far`.
+///
+/// Empty (all 0) where nothing can be told: no usable source, no parallax, an impossible range.
+pub fn sweep(reference: &MvsView, sources: &[&MvsView], near: f64, far: f64, params: &MvsParams) -> RawDepth {
+    let reference = Prepared::new(reference, params);
+    let sources: Vec<Prepared> = sources.iter().map(|source| Prepared::new(source, params)).collect();
+    sweep_prepared(&reference, &sources.iter().collect::<Vec<_>>(), near, far, params)
+}
+
+/// Keeps the depths that at least `params.min_views` of `others` agree with; all other confidences are 0.
+pub fn verify(reference: (&MvsView, &RawDepth), others: &[(&MvsView, &RawDepth)], params: &MvsParams) -> DepthMap {
+    let others: Vec<(Rigid, &RawDepth)> = others.iter().map(|(view, raw)| (view.world_from_cam, *raw)).collect();
+    consistency::verify((reference.0.world_from_cam, reference.1), &others, params)
+}
+
+/// What matching needs of a view: grey, at the size of the depth map.
+#[derive(Debug, Clone)]
+struct Prepared {
+    grey: grey::Grey,
+    intrinsics: Intrinsics,
+    world_from_cam: Rigid,
+}
+
+impl Prepared {
+    fn new(view: &MvsView, params: &MvsParams) -> Self {
+        let grey = grey::Grey::of_image(&view.image, params);
+        let intrinsics = view.intrinsics.resized(grey.width as u32, grey.height as u32);
+        Self { grey, intrinsics, world_from_cam: view.world_from_cam }
+    }
+
+    fn is_usable(&self) -> bool {
+        let unit = (self.world_from_cam.rotation.length_squared() - 1.0).abs() < 1e-3;
+        self.world_from_cam.is_finite() && unit && self.intrinsics.is_plausible() && self.grey.width >= MIN_SIDE_PX
+            && self.grey.height >= MIN_SIDE_PX
+    }
+}
+
+/// Two matching windows; smaller pictures hold no depth worth having.
+const MIN_SIDE_PX: usize = 2 * sweep::WINDOW;
+
+fn sweep_prepared(reference: &Prepared, sources: &[&Prepared], near: f64, far: f64, params: &MvsParams) -> RawDepth {
+    let empty = RawDepth::empty(reference.intrinsics);
+    let range_fits = near.is_finite() && far.is_finite() && near > 0.0 && far > near * 1.000_1;
+    if !range_fits || !reference.is_usable() {
+        return empty;
+    }
+    let planes = sweep::Planes { inverse_near: 1.0 / near, inverse_far: 1.0 / far, n: params.n_depths.max(3) };
+    let warps: Vec<sweep::Warp<'_>> = sources
+        .iter()
+        .filter(|source| source.is_usable())
+        .filter_map(|source| sweep::Warp::new(reference, source, &planes))
+        .take(params.n_sources)
+        .collect();
+    if warps.is_empty() {
+        return empty;
+    }
+    let costs = sweep::matching_costs(&reference.grey, &warps, &planes);
+    let winners = sgm::best_planes(&reference.grey, &costs, planes.n);
+    let depth = winners.plane.iter().map(|&plane| planes.depth(plane)).collect();
+    RawDepth { intrinsics: reference.intrinsics, depth, score: winners.score, margin: winners.margin }
+}
+
+impl RawDepth {
+    fn empty(intrinsics: Intrinsics) -> Self {
+        let n = intrinsics.width_px as usize * intrinsics.height_px as usize;
+        Self { intrinsics, depth: vec![0.0; n], score: vec![0.0; n], margin: vec![0.0; n] }
+    }
+}

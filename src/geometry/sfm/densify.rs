@@ -1,0 +1,103 @@
+//! Placed keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
+
+use std::collections::BTreeMap;
+
+use super::report::{SparseBatch, SparseView};
+use crate::camera::Intrinsics;
+use crate::config::MvsParams;
+use crate::frame::{DepthMap, RgbImage};
+use crate::geometry::mvs::MvsView;
+use crate::geometry::mvs::neighbours::depth_range;
+use crate::geometry::mvs::state::MvsState;
+use crate::geometry::{GeometryBatch, View};
+use std::sync::Arc;
+
+/// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
+const MAX_HELD: usize = 96;
+/// Poses that moved its pixels by more since the sweep make a depth map out of date.
+const MAX_DRIFT_PX: f64 = 1.0;
+
+/// Stereo for a stream of keyframes.
+#[derive(Debug)]
+pub(super) struct Densifier {
+    params: MvsParams,
+    state: MvsState,
+    intrinsics: BTreeMap<u32, Intrinsics>,
+    /// Sources that the last sweep of a keyframe had.
+    n_sources: BTreeMap<u32, usize>,
+}
+
+impl Densifier {
+    pub(super) fn new(params: &MvsParams) -> Self {
+        Self {
+            params: params.clone(),
+            state: MvsState::new(params.clone(), MAX_HELD),
+            intrinsics: BTreeMap::new(),
+            n_sources: BTreeMap::new(),
+        }
+    }
+
+    /// `image_of` gives the picture of a keyframe.
+    pub(super) fn densify(
+        &mut self,
+        sparse: SparseBatch,
+        image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
+    ) -> GeometryBatch {
+        for (id, _, pose) in &sparse.revised {
+            if let Some(intrinsics) = self.intrinsics.get(id) {
+                self.state.revise(*id, *intrinsics, *pose);
+            }
+        }
+        // All pictures first: the views of one batch are each other's best sources.
+        for view in &sparse.views {
+            self.hold(view, image_of);
+        }
+        for view in &sparse.views {
+            self.sweep(view);
+        }
+        let views = sparse.views.iter().map(|view| self.view(view)).collect();
+        GeometryBatch { batch_id: sparse.batch_id, views, revised: sparse.revised, note: sparse.note }
+    }
+
+    fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
+        let (id, world_from_cam) = (view.keyframe_id, view.batch_from_cam);
+        self.intrinsics.insert(id, view.intrinsics);
+        if self.state.holds(id) {
+            self.state.revise(id, view.intrinsics, world_from_cam);
+        } else if let Some(image) = image_of(id) {
+            self.state.add(id, &MvsView { image, intrinsics: view.intrinsics, world_from_cam }, 1.0, 2.0, &[]);
+        }
+        while self.intrinsics.len() > MAX_HELD {
+            self.intrinsics.pop_first();
+            self.n_sources.pop_first();
+        }
+    }
+
+    /// Sweeps a new view, and one swept before when it had too few sources or its camera has moved.
+    fn sweep(&mut self, view: &SparseView) {
+        let id = view.keyframe_id;
+        let neighbours: Vec<u32> =
+            view.neighbours.iter().map(|n| n.keyframe_id).filter(|n| self.state.holds(*n)).collect();
+        let n_sources = neighbours.len().min(self.params.n_sources);
+        let is_current = self.n_sources.get(&id).is_some_and(|had| *had >= n_sources)
+            && self.state.drift_px(id).is_none_or(|drift| drift <= MAX_DRIFT_PX);
+        let cam_from_batch = view.batch_from_cam.inverse();
+        let depths: Vec<f64> =
+            view.landmarks.iter().map(|l| cam_from_batch.transform_point(l.point_in_batch).z).collect();
+        let Some((near, far)) = depth_range(&depths).filter(|_| !is_current && n_sources > 0) else { return };
+        self.state.resweep(id, near, far, &neighbours);
+        self.n_sources.insert(id, n_sources);
+    }
+
+    fn view(&self, view: &SparseView) -> View {
+        let none = || DepthMap { width_px: 0, height_px: 0, depth: Vec::new(), confidence: Vec::new() };
+        View {
+            keyframe_id: view.keyframe_id,
+            component: view.component,
+            intrinsics: view.intrinsics,
+            batch_from_cam: view.batch_from_cam,
+            depth: self.state.depth_of(view.keyframe_id).unwrap_or_else(none),
+            health: view.health,
+        }
+    }
+}

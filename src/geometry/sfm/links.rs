@@ -1,0 +1,126 @@
+//! A new shot -> verified matches with the shots before it: the last few, and those that look alike.
+
+use glam::DVec2;
+use rayon::prelude::*;
+
+use super::scene::{Link, Scene, Shot};
+use crate::geometry::features::Features;
+use crate::geometry::matching::{Wide, matches};
+use crate::geometry::two_view::{fundamental, motion};
+
+/// Shots just before a new one that are always compared with it.
+const N_RECENT: usize = 6;
+/// Older shots that look alike and are compared, too: jumps and loops need them.
+const N_ALIKE: usize = 4;
+/// Descriptors in a signature.
+const SIGNATURE: usize = 192;
+/// Matching signatures below which two pictures do not look alike.
+const MIN_VOTES: usize = 6;
+/// Older shots asked for likeness; beyond it they are taken evenly.
+const MAX_ASKED: usize = 600;
+/// Verified matches that make a link; fewer are as likely chance.
+const MIN_LINK: usize = 15;
+
+/// The coarsest descriptors of a picture: they survive the largest changes of view.
+pub(super) fn signature(features: &Features) -> Wide {
+    let mut order: Vec<usize> = (0..features.len()).collect();
+    order.sort_by(|&a, &b| features.sigmas[b].total_cmp(&features.sigmas[a]));
+    let picked: Vec<_> = order.iter().take(SIGNATURE).map(|&i| features.descriptors[i]).collect();
+    Wide::new(&picked)
+}
+
+/// Links the newest shot (the last) to earlier ones.
+pub(super) fn link_newest(scene: &mut Scene, max_error_px: f64, seed: u64) {
+    let Some(newest) = scene.shots.len().checked_sub(1) else { return };
+    let recent = newest.saturating_sub(N_RECENT);
+    let mut others = alike(scene, newest, recent);
+    others.extend(recent..newest);
+    link(scene, newest, &others, max_error_px, seed);
+}
+
+/// Links one shot to those that look alike but were not compared with it, later ones included.
+pub(super) fn link_alike(scene: &mut Scene, shot_ix: usize, max_error_px: f64, seed: u64) -> bool {
+    let before = scene.links.len();
+    let pool = scene.shots.len();
+    let others: Vec<usize> = alike(scene, shot_ix, pool)
+        .into_iter()
+        .filter(|&o| !scene.links.contains_key(&(o.min(shot_ix), o.max(shot_ix))))
+        .collect();
+    link(scene, shot_ix, &others, max_error_px, seed);
+    scene.links.len() > before
+}
+
+/// Of the first `pool` shots, those whose signatures match best.
+fn alike(scene: &Scene, shot_ix: usize, pool: usize) -> Vec<usize> {
+    let stride = pool.div_ceil(MAX_ASKED).max(1);
+    let asked: Vec<usize> = (0..pool).step_by(stride).filter(|&o| o != shot_ix).collect();
+    let own = &scene.shots[shot_ix].signature;
+    let votes = |&o: &usize| (matches(own, &scene.shots[o].signature).len(), o);
+    let mut ranked: Vec<(usize, usize)> = asked.par_iter().map(votes).collect();
+    ranked.retain(|r| r.0 >= MIN_VOTES);
+    ranked.sort_by(|a, b| b.0.cmp(&a.0).then(b.1.cmp(&a.1)));
+    ranked.truncate(N_ALIKE);
+    ranked.into_iter().map(|r| r.1).collect()
+}
+
+fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, seed: u64) {
+    let wide = Wide::new(&scene.shots[shot_ix].features.descriptors);
+    // The first component settles the focal length; from then on the stricter check is possible.
+    let focal_known = !scene.components.is_empty();
+    let compare = |&other: &usize| {
+        let raw = matches(&Wide::new(&scene.shots[other].features.descriptors), &wide);
+        let link = verified(
+            &scene.shots[other],
+            &scene.shots[shot_ix],
+            &raw,
+            focal_known,
+            (max_error_px, pair_seed(seed, other, shot_ix)),
+        );
+        link.map(|link| (other, link))
+    };
+    let found: Vec<(usize, Link)> = others.par_iter().filter_map(compare).collect();
+    for (other, link) in found {
+        for &(theirs, ours) in &link.matches {
+            scene.shots[other].matched[theirs as usize].push((shot_ix as u32, ours));
+            scene.shots[shot_ix].matched[ours as usize].push((other as u32, theirs));
+        }
+        let flipped = other > shot_ix;
+        let link = if flipped { reversed(&link) } else { link };
+        scene.links.insert((other.min(shot_ix), other.max(shot_ix)), link);
+    }
+}
+
+fn reversed(link: &Link) -> Link {
+    let matches = link.matches.iter().map(|&(a, b)| (b, a)).collect();
+    Link { matches, motion: link.motion.map(|(pose, parallax)| (pose.inverse(), parallax)) }
+}
+
+pub(super) fn pair_seed(seed: u64, a: usize, b: usize) -> u64 {
+    seed ^ (a as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (b as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
+}
+
+/// Pixel pairs of matches between two shots.
+pub(super) fn pixel_pairs(a: &Shot, b: &Shot, matches: &[(u32, u32)]) -> Vec<(DVec2, DVec2)> {
+    matches.iter().map(|&(i, j)| (a.features.pixels[i as usize], b.features.pixels[j as usize])).collect()
+}
+
+fn verified(
+    a: &Shot,
+    b: &Shot,
+    raw: &[(u32, u32)],
+    focal_known: bool,
+    (max_error_px, seed): (f64, u64),
+) -> Option<Link> {
+    if raw.len() < MIN_LINK {
+        return None;
+    }
+    let pairs = pixel_pairs(a, b, raw);
+    let (inliers, motion) = if focal_known || (a.is_calibrated && b.is_calibrated) {
+        let found = motion(&pairs, [&a.lens, &b.lens], max_error_px, seed)?;
+        (found.inliers, Some((found.second_from_first, found.parallax_deg)))
+    } else {
+        (fundamental(&pairs, max_error_px, seed)?.1, None)
+    };
+    let matches: Vec<(u32, u32)> = inliers.iter().map(|&i| raw[i]).collect();
+    (matches.len() >= MIN_LINK).then_some(Link { matches, motion })
+}

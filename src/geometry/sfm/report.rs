@@ -1,0 +1,173 @@
+//! The scene -> what changed since it was last told: new views, moved poses, why shots are missing.
+
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3};
+
+use super::scene::{NONE, Scene};
+use super::starting::{Start, parallax_deg};
+use crate::camera::Intrinsics;
+use crate::geometry::Health;
+use crate::geometry::two_view::median;
+use crate::pose::Rigid;
+
+/// Exact words of the final error for a camera at rest; other modules and users look for them.
+pub const NO_PARALLAX: &str = "no parallax was seen between keyframes";
+/// A pose that moved less needs no telling: 0.05 px at 500 px focal length, and as much of the median depth.
+const MOVED: f64 = 1e-4;
+
+/// A landmark in a view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sighting {
+    pub point_in_batch: DVec3,
+    /// In the keyframe's picture.
+    pub pixel: DVec2,
+}
+
+/// A keyframe that sees the same landmarks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    pub keyframe_id: u32,
+    pub n_shared: u32,
+    /// Median angle between the two rays to a shared landmark.
+    pub angle_deg: f64,
+}
+
+/// A placed keyframe without dense depth.
+#[derive(Debug, Clone)]
+pub struct SparseView {
+    pub keyframe_id: u32,
+    pub component: u32,
+    /// At the size of the keyframe's picture.
+    pub intrinsics: Intrinsics,
+    pub batch_from_cam: Rigid,
+    pub health: Health,
+    pub landmarks: Vec<Sighting>,
+    /// Most useful first: many shared landmarks, seen at an angle of some degrees.
+    pub neighbours: Vec<Neighbour>,
+}
+
+#[derive(Debug, Clone, Default)]
+pub struct SparseBatch {
+    pub batch_id: u32,
+    pub views: Vec<SparseView>,
+    /// (keyframe id, component, batch_from_cam) of views given earlier that moved.
+    pub revised: Vec<(u32, u32, Rigid)>,
+    pub note: Option<String>,
+}
+
+/// What has been told of each keyframe.
+#[derive(Debug, Default)]
+pub(super) struct Told {
+    poses: BTreeMap<usize, (u32, Rigid)>,
+}
+
+impl Told {
+    /// Views of shots placed since last time and of `again`, and poses that moved.
+    pub(super) fn changes(&mut self, scene: &Scene, again: &[usize]) -> SparseBatch {
+        let mut out = SparseBatch::default();
+        for (shot_ix, shot) in scene.shots.iter().enumerate() {
+            let Some(placed) = &shot.placed else { continue };
+            let here = (placed.component, placed.cam_from_map.inverse());
+            let before = self.poses.insert(shot_ix, here);
+            if before.is_none() || again.contains(&shot_ix) {
+                out.views.extend(view(scene, shot_ix));
+            } else if let Some(before) = before {
+                let moved = before.0 != here.0
+                    || before.1.angle_to(&here.1) > MOVED
+                    || before.1.translation.distance(here.1.translation) > MOVED;
+                if moved {
+                    out.revised.push((shot.keyframe.id, here.0, here.1));
+                } else {
+                    // Small moves add up: compare with what was told.
+                    self.poses.insert(shot_ix, before);
+                }
+            }
+        }
+        out
+    }
+}
+
+/// One sentence on what is missing; `None` when all is placed in one frame.
+pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
+    let waiting: Vec<u32> = scene.shots.iter().filter(|s| s.placed.is_none()).map(|s| s.keyframe.id).collect();
+    if waiting.len() == scene.shots.len() {
+        let why = match start {
+            Some(Start::NoMatches) => ": their pictures share too few distinct points",
+            Some(Start::Unstable) => " that a scene could be built on",
+            _ => "",
+        };
+        return Some(format!("{NO_PARALLAX}{why}"));
+    }
+    let n_components = scene.components.iter().filter(|c| !c.shots.is_empty()).count();
+    if waiting.is_empty() {
+        return (n_components > 1)
+            .then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
+    }
+    let shown: Vec<String> = waiting.iter().take(10).map(u32::to_string).collect();
+    let more = if waiting.len() > 10 { ", ..." } else { "" };
+    Some(format!(
+        "{} of {} keyframes wait for landmarks that agree: {}{more}",
+        waiting.len(),
+        scene.shots.len(),
+        shown.join(", ")
+    ))
+}
+
+fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
+    let shot = &scene.shots[shot_ix];
+    let placed = shot.placed.as_ref()?;
+    let image = &shot.keyframe.frame.image;
+    let to_picture = DVec2::new(
+        f64::from(image.width_px) / f64::from(shot.lens.width_px),
+        f64::from(image.height_px) / f64::from(shot.lens.height_px),
+    );
+    let mut landmarks = Vec::new();
+    let mut errors = Vec::new();
+    for (feature, &landmark) in shot.landmark_of.iter().enumerate().filter(|(_, l)| **l != NONE) {
+        let at = (shot_ix as u32, feature as u32);
+        let point_in_batch = scene.landmarks[landmark as usize].point;
+        errors.extend(scene.sight(at).map(|s| s.error_px(point_in_batch)));
+        landmarks.push(Sighting { point_in_batch, pixel: scene.pixel(at) * to_picture });
+    }
+    let health = Health {
+        n_inliers: landmarks.len() as u32,
+        parallax_deg: parallax_deg(scene, shot_ix),
+        reprojection_px: median(&mut errors).unwrap_or(0.0),
+    };
+    Some(SparseView {
+        keyframe_id: shot.keyframe.id,
+        component: placed.component,
+        intrinsics: scene.intrinsics_of(shot.keyframe.id)?,
+        batch_from_cam: placed.cam_from_map.inverse(),
+        health,
+        landmarks,
+        neighbours: neighbours(scene, shot_ix),
+    })
+}
+
+fn neighbours(scene: &Scene, shot_ix: usize) -> Vec<Neighbour> {
+    let Some(own) = scene.centre(shot_ix) else { return Vec::new() };
+    let mut angles: BTreeMap<u32, Vec<f64>> = BTreeMap::new();
+    for &landmark in scene.shots[shot_ix].landmark_of.iter().filter(|l| **l != NONE) {
+        let landmark = &scene.landmarks[landmark as usize];
+        for &(other, _) in landmark.seen.iter().filter(|s| s.0 as usize != shot_ix) {
+            let Some(centre) = scene.centre(other as usize) else { continue };
+            let (a, b) = (own - landmark.point, centre - landmark.point);
+            angles.entry(other).or_default().push(a.cross(b).length().atan2(a.dot(b)).to_degrees());
+        }
+    }
+    let neighbour = |(other, mut angles): (u32, Vec<f64>)| Neighbour {
+        keyframe_id: scene.shots[other as usize].keyframe.id,
+        n_shared: angles.len() as u32,
+        angle_deg: median(&mut angles).unwrap_or(0.0),
+    };
+    // Matching wants an angle of about 6 degrees (GEOMETRY.md 3): less tells no depth, more changes the picture.
+    let worth = |n: &Neighbour| {
+        let off = (n.angle_deg.max(0.01) / 6.0).ln();
+        f64::from(n.n_shared) * (-0.5 * off * off).exp()
+    };
+    let mut found: Vec<Neighbour> = angles.into_iter().map(neighbour).collect();
+    found.sort_by(|a, b| worth(b).total_cmp(&worth(a)).then(a.keyframe_id.cmp(&b.keyframe_id)));
+    found
+}

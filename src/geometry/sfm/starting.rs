@@ -1,0 +1,172 @@
+//! Waiting shots -> a new component: the pair with most parallax, its landmarks, and all that can be placed on them.
+
+use super::Limits;
+use super::adjusting::{adjust_global, median_error_px};
+use super::landmarks::extend;
+use super::links::{pair_seed, pixel_pairs};
+use super::placing::grow;
+use super::scene::{Component, NONE, Scene};
+use crate::geometry::triangulate::widest_angle;
+use crate::geometry::two_view::{homography_share, median, motion};
+use crate::pose::{Rigid, Similarity};
+
+/// Pairs that are tried before waiting for more keyframes.
+const MAX_ATTEMPTS: usize = 5;
+/// More parallax than this is no better: wide views share fewer matches.
+const ENOUGH_PARALLAX_DEG: f64 = 12.0;
+/// Share of matches on one plane from which on a pair is a poor start: two motions explain it about equally well.
+const PLANE_SHARE: f64 = 0.85;
+
+/// A start that places this share of the waiting shots is taken without trying other pairs.
+const GOOD_SHARE: f64 = 0.7;
+/// Share of the matches that a sound scene explains: right starts measured 0.75 (driving) to
+/// 0.98, wrong ones 0.50 and less.
+const MIN_EXPLAINED: f64 = 0.62;
+
+/// What came of trying to start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Start {
+    Started,
+    /// No pair has matches enough.
+    NoMatches,
+    /// Pairs match, but their rays are parallel: the camera rests or only turns.
+    NoParallax,
+    /// There was parallax, but no pair gave a scene that held.
+    Unstable,
+}
+
+/// Tries to start a component from waiting shots of `pool` with at least `min_shots` in it.
+pub(super) fn start(scene: &mut Scene, pool: &[usize], min_shots: usize, limits: &Limits) -> Start {
+    let waiting: Vec<usize> = pool.iter().copied().filter(|&s| scene.shots[s].placed.is_none()).collect();
+    let (pairs, has_matches) = ranked_pairs(scene, &waiting, limits);
+    if pairs.is_empty() {
+        return if has_matches { Start::NoParallax } else { Start::NoMatches };
+    }
+    let mut best: Option<(usize, (usize, usize))> = None;
+    for (_, a, b) in pairs.into_iter().take(MAX_ATTEMPTS) {
+        let Some(n) = attempt(scene, &waiting, (a, b), min_shots, limits) else { continue };
+        if n as f64 >= GOOD_SHARE * waiting.len() as f64 {
+            return Start::Started;
+        }
+        // Another pair may reach more shots.
+        let last = scene.components.len() as u32 - 1;
+        scene.dissolve(last);
+        if best.is_none_or(|b| n > b.0) {
+            best = Some((n, (a, b)));
+        }
+    }
+    let again = best.and_then(|(_, pair)| attempt(scene, &waiting, pair, min_shots, limits));
+    if again.is_some() { Start::Started } else { Start::Unstable }
+}
+
+/// Pairs with parallax, best first, and whether any pair had matches enough.
+fn ranked_pairs(scene: &mut Scene, waiting: &[usize], limits: &Limits) -> (Vec<(f64, usize, usize)>, bool) {
+    let mut pairs = Vec::new();
+    let mut has_matches = false;
+    let keys: Vec<(usize, usize)> = scene.links.keys().copied().collect();
+    for (a, b) in keys.into_iter().filter(|(a, b)| waiting.contains(a) && waiting.contains(b)) {
+        let link = &scene.links[&(a, b)];
+        let n = link.matches.len();
+        if n < limits.min_inliers {
+            continue;
+        }
+        has_matches = true;
+        let seed = pair_seed(limits.seed, a, b);
+        let pixels = pixel_pairs(&scene.shots[a], &scene.shots[b], &link.matches);
+        let lenses = [&scene.shots[a].lens, &scene.shots[b].lens];
+        let found = link.motion.or_else(|| {
+            motion(&pixels, lenses, limits.max_error_px, seed).map(|m| (m.second_from_first, m.parallax_deg))
+        });
+        let Some((pose, parallax)) = found else { continue };
+        if parallax < limits.min_parallax_deg {
+            continue;
+        }
+        let plane = homography_share(&pixels, limits.max_error_px, seed);
+        let is_calibrated = scene.shots[a].is_calibrated && scene.shots[b].is_calibrated;
+        // With a wrong focal length a mere turn looks like parallax.
+        if plane > PLANE_SHARE && !is_calibrated && scene.components.is_empty() {
+            continue;
+        }
+        let flat = if plane > PLANE_SHARE { 0.1 } else { 1.0 };
+        pairs.push((flat * n as f64 * parallax.min(ENOUGH_PARALLAX_DEG), a, b));
+        if let Some(link) = scene.links.get_mut(&(a, b)) {
+            link.motion = Some((pose, parallax));
+        }
+    }
+    pairs.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+    (pairs, has_matches)
+}
+
+/// Shots of the new component; `None` and no component where the scene does not hold.
+fn attempt(
+    scene: &mut Scene,
+    waiting: &[usize],
+    (a, b): (usize, usize),
+    min_shots: usize,
+    limits: &Limits,
+) -> Option<usize> {
+    let (pose, _) = scene.links[&(a, b)].motion?;
+    let component = scene.components.len() as u32;
+    scene.components.push(Component::default());
+    scene.place(a, component, Rigid::IDENTITY);
+    scene.place(b, component, pose);
+    extend(scene, b, limits.max_error_px);
+    adjust_global(scene, component, limits.max_error_px, 15);
+    extend(scene, b, limits.max_error_px);
+    let n = scene.landmarks_of(&[a, b]).len();
+    if n >= limits.min_inliers && parallax_deg(scene, b) >= limits.min_parallax_deg {
+        for &shot in waiting {
+            scene.shots[shot].failed_with = 0;
+        }
+        grow(scene, waiting, limits);
+        adjust_global(scene, component, limits.max_error_px, 15);
+        let shots = &scene.components[component as usize].shots;
+        let n = shots.len();
+        let explained = explained_share(scene, component);
+        let error_px = median_error_px(scene, shots);
+        tracing::debug!(a, b, n, explained, error_px, "start of a component");
+        if n >= min_shots && error_px <= 0.75 * limits.max_error_px && explained >= MIN_EXPLAINED {
+            normalise(scene, component, a);
+            return Some(n);
+        }
+    }
+    scene.dissolve(component);
+    None
+}
+
+/// Median of the widest angles at which the landmarks of a shot are seen.
+pub(super) fn parallax_deg(scene: &Scene, shot_ix: usize) -> f64 {
+    let seen = scene.shots[shot_ix].landmark_of.iter().filter(|l| **l != NONE);
+    let angle = |&l: &u32| {
+        let landmark = &scene.landmarks[l as usize];
+        let centres: Vec<_> = landmark.seen.iter().filter_map(|at| scene.centre(at.0 as usize)).collect();
+        widest_angle(&centres, landmark.point).to_degrees()
+    };
+    median(&mut seen.map(angle).collect::<Vec<f64>>()).unwrap_or(0.0)
+}
+
+/// Of the matches between the shots of a component, the share whose two features see one landmark. A scene turned
+/// inside out (the bas-relief ambiguity) has small errors, too, but leaves many matches out.
+pub(super) fn explained_share(scene: &Scene, component: u32) -> f64 {
+    let (mut explained, mut all) = (0, 0);
+    for ((a, b), link) in &scene.links {
+        if scene.component_of(*a) != Some(component) || scene.component_of(*b) != Some(component) {
+            continue;
+        }
+        let (first, second) = (&scene.shots[*a], &scene.shots[*b]);
+        let agrees = |m: &&(u32, u32)| {
+            let landmark = first.landmark_of[m.0 as usize];
+            landmark != NONE && landmark == second.landmark_of[m.1 as usize]
+        };
+        explained += link.matches.iter().filter(agrees).count();
+        all += link.matches.len();
+    }
+    explained as f64 / f64::from(all.max(1) as u32)
+}
+
+/// Median depth in the first shot becomes 1.
+fn normalise(scene: &mut Scene, component: u32, first: usize) {
+    if let Some(depth) = median(&mut scene.depths(first)).filter(|d| *d > 0.0) {
+        scene.transform(component, &Similarity { scale: 1.0 / depth, ..Similarity::IDENTITY });
+    }
+}

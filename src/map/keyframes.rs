@@ -1,0 +1,96 @@
+//! Keyframes of the map: where each stands, in the model's frame and in the engine.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use crate::camera::Intrinsics;
+use crate::frame::{DepthMap, Keyframe, RgbImage};
+use crate::geometry::{Health, View};
+use crate::pose::Rigid;
+
+/// A keyframe with a place in the map.
+#[derive(Debug, Clone)]
+pub struct Placed {
+    pub keyframe: Arc<Keyframe>,
+    /// Index in the engine.
+    pub view_ix: usize,
+    /// Last pose that the geometry model gave, in its own frame.
+    pub model_from_cam: Rigid,
+    /// The picture that is trained on, and its camera.
+    pub image: Arc<RgbImage>,
+    pub intrinsics: Intrinsics,
+    /// In map units.
+    pub depth: Arc<DepthMap>,
+    pub health: Health,
+    /// Kept out of optimisation, measures quality.
+    pub is_held_out: bool,
+}
+
+/// Everything that has come and may still be used, by keyframe id.
+#[derive(Debug, Default)]
+pub struct Keyframes {
+    pub placed: BTreeMap<u32, Placed>,
+    /// Without a pose so far; the oldest go when there are too many.
+    pub waiting: BTreeMap<u32, Arc<Keyframe>>,
+    /// Placed by the model, but in a component that has no known relation to the map.
+    pub foreign: BTreeMap<u32, View>,
+}
+
+impl Keyframes {
+    /// Remembers keyframes until they are placed. Returns how many had to be given up.
+    pub fn remember(&mut self, keyframes: &[Arc<Keyframe>], max_waiting: usize) -> usize {
+        for keyframe in keyframes {
+            if !self.placed.contains_key(&keyframe.id) {
+                self.waiting.insert(keyframe.id, Arc::clone(keyframe));
+            }
+        }
+        let n_given_up = self.waiting.len().saturating_sub(max_waiting);
+        for _ in 0..n_given_up {
+            if let Some((id, _)) = self.waiting.pop_first() {
+                self.foreign.remove(&id);
+            }
+        }
+        n_given_up
+    }
+
+    /// Number of keyframes per component other than the map's own.
+    pub fn foreign_counts(&self) -> BTreeMap<u32, usize> {
+        let mut counts = BTreeMap::new();
+        for view in self.foreign.values() {
+            *counts.entry(view.component).or_insert(0) += 1;
+        }
+        counts
+    }
+
+    /// (pose in the map, pose in the model's frame) of all that are placed; `map_poses` by view index.
+    pub fn pose_pairs(&self, map_poses: &[Rigid]) -> Vec<(Rigid, Rigid)> {
+        self.placed
+            .values()
+            .map(|p| (map_poses[p.view_ix].inverse(), p.model_from_cam))
+            .collect()
+    }
+}
+
+/// The same depth in another unit.
+pub fn rescaled(depth: &DepthMap, factor: f64) -> DepthMap {
+    let mut depth = depth.clone();
+    for value in &mut depth.depth {
+        *value = (f64::from(*value) * factor) as f32;
+    }
+    depth
+}
+
+/// Median of the verified depths; `None` where there are none.
+pub fn median_depth(depth: &DepthMap) -> Option<f32> {
+    let usable = depth
+        .depth
+        .iter()
+        .zip(&depth.confidence)
+        .filter(|(d, c)| **c > 0.0 && **d > 0.0 && d.is_finite());
+    let mut values: Vec<f32> = usable.map(|(d, _)| *d).collect();
+    if values.is_empty() {
+        return None;
+    }
+    let middle = values.len() / 2;
+    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}

@@ -1,0 +1,133 @@
+//! What the geometry model learns later -> poses that move, components that join or take over.
+
+use std::collections::BTreeMap;
+
+use crate::geometry::{GeometryBatch, View};
+use crate::map::{SplatMap, align, keyframes};
+use crate::pose::{Rigid, Similarity};
+
+/// A component of at least this many keyframes, and this many times as large as the map's, takes the map's place.
+const MIN_TAKEOVER: usize = 8;
+const TAKEOVER_RATIO: usize = 2;
+/// A revision that moves a camera by less, as a share of the scene's depth or in radians, is left to the optimiser.
+const MIN_REVISION: f64 = 5e-4;
+
+impl SplatMap {
+    /// Cameras that the model moved: their refined poses and the splats seeded from them move along.
+    pub(super) fn revise(&mut self, geometry: &GeometryBatch) {
+        let map_poses = self.engine.poses();
+        let map_from_model =
+            align::align(&self.keyframes.pose_pairs(&map_poses)).unwrap_or(Similarity::IDENTITY);
+        let mut motions = BTreeMap::new();
+        let mut joined = Vec::new();
+        for (id, component, model_from_cam) in &geometry.revised {
+            if let Some(view) = self.keyframes.foreign.get(id) {
+                if Some(*component) == self.component {
+                    joined.push((view.component, *id, *model_from_cam));
+                } else if let Some(view) = self.keyframes.foreign.get_mut(id) {
+                    (view.component, view.batch_from_cam) = (*component, *model_from_cam);
+                }
+                continue;
+            }
+            let Some(placed) = self.keyframes.placed.get_mut(id) else {
+                continue;
+            };
+            let model_motion = *model_from_cam * placed.model_from_cam.inverse();
+            placed.model_from_cam = *model_from_cam;
+            let angle = model_motion.angle_to(&Rigid::IDENTITY);
+            let old = map_poses[placed.view_ix].inverse();
+            let new = map_from_model.transform_pose(model_from_cam);
+            let moved = (new.translation - old.translation).length() / f64::from(self.scene_depth);
+            if angle.max(moved) > MIN_REVISION {
+                motions.insert(*id, new * old.inverse());
+                self.engine.set_pose(placed.view_ix, new.inverse());
+            }
+        }
+        if !motions.is_empty() {
+            let mut splats = self.engine.splats();
+            for i in 0..splats.len() {
+                if let Some(motion) = motions.get(&splats.anchors[i]) {
+                    align::carry(motion, &mut splats.means[i], &mut splats.quats[i]);
+                }
+            }
+            self.engine.overwrite(&splats);
+            self.epoch += 1;
+        }
+        self.join(&joined);
+    }
+
+    /// Views of another component whose poses the model has linked to ours: (old component, id, pose in our frame).
+    fn join(&mut self, joined: &[(u32, u32, Rigid)]) {
+        let mut views: Vec<View> = Vec::new();
+        for (component, id, pose) in joined {
+            let pairs: Vec<(Rigid, Rigid)> = joined
+                .iter()
+                .filter(|(other, ..)| other == component)
+                .filter_map(|(_, id, pose)| {
+                    Some((*pose, self.keyframes.foreign.get(id)?.batch_from_cam))
+                })
+                .collect();
+            let factor = align::align(&pairs).map_or(1.0, |similarity| similarity.scale);
+            if let Some(view) = self.keyframes.foreign.get(id) {
+                let depth = keyframes::rescaled(&view.depth, factor);
+                let component = self.component.unwrap_or(view.component);
+                views.push(View {
+                    depth,
+                    component,
+                    batch_from_cam: *pose,
+                    ..view.clone()
+                });
+            }
+        }
+        for view in &views {
+            self.keyframes.foreign.remove(&view.keyframe_id);
+        }
+        self.place(views, None);
+    }
+
+    /// When another component has grown far beyond the map's, the map starts again from it.
+    pub(super) fn take_over(&mut self) -> Vec<View> {
+        let own = self.keyframes.placed.len();
+        let largest = self
+            .keyframes
+            .foreign_counts()
+            .into_iter()
+            .max_by_key(|(_, n)| *n);
+        let Some((component, n)) =
+            largest.filter(|(_, n)| *n >= MIN_TAKEOVER && *n >= TAKEOVER_RATIO * own.max(1))
+        else {
+            return Vec::new();
+        };
+        tracing::warn!(
+            "component {component} with {n} keyframes takes the place of the map of {own}"
+        );
+        self.engine.retain(&vec![false; self.engine.n_splats()]);
+        let old_component = self.component.unwrap_or_default();
+        for (id, placed) in std::mem::take(&mut self.keyframes.placed) {
+            let view = View {
+                keyframe_id: id,
+                component: old_component,
+                intrinsics: placed.intrinsics,
+                batch_from_cam: placed.model_from_cam,
+                depth: (*placed.depth).clone(),
+                health: placed.health,
+            };
+            self.keyframes.foreign.insert(id, view);
+            self.keyframes.waiting.insert(id, placed.keyframe);
+        }
+        self.trainable.clear();
+        self.schedule.restart_round();
+        self.component = Some(component);
+        self.epoch += 1;
+        let ids: Vec<u32> = self
+            .keyframes
+            .foreign
+            .values()
+            .filter(|v| v.component == component)
+            .map(|v| v.keyframe_id)
+            .collect();
+        ids.into_iter()
+            .filter_map(|id| self.keyframes.foreign.remove(&id))
+            .collect()
+    }
+}

@@ -1,0 +1,187 @@
+//! The node: stages on threads with bounded queues between them, or one after the other in sequence.
+//!
+//! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
+
+pub mod pipeline;
+pub mod run_dir;
+mod stages;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+
+use crate::clock::{Stamp, Stopwatch};
+use crate::config::{Backend, Params, PublishParams};
+use crate::geometry::GeometryModel;
+use crate::geometry::known::Known;
+use crate::geometry::sfm::Sfm;
+use crate::map::SplatMap;
+use crate::node::pipeline::Subscriber;
+use crate::map::snapshot::{ScaleSource, Snapshot};
+use crate::pose::Rigid;
+use crate::source::{Source, SourceCounts};
+use crate::splat::Engine;
+use crate::splat::cpu::CpuEngine;
+
+
+
+/// How often a lingering node looks for Ctrl-C.
+const LINGER_TICK: Duration = Duration::from_millis(50);
+
+/// What a run is made of.
+pub struct Job {
+    pub source: Box<dyn Source>,
+    pub params: Params,
+    /// A live source drops frames rather than wait, and the map is optimised as long as frames come.
+    pub is_live: bool,
+    pub stop: Stop,
+}
+
+impl std::fmt::Debug for Job {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Job(live: {}, {:?})", self.is_live, self.params)
+    }
+}
+
+/// Asks the source to end; everything behind it then ends in order, without the final steps.
+#[derive(Debug, Clone, Default)]
+pub struct Stop {
+    is_asked: Arc<AtomicBool>,
+}
+
+impl Stop {
+    pub fn ask(&self) {
+        self.is_asked.store(true, Ordering::Relaxed);
+    }
+
+    pub fn is_asked(&self) -> bool {
+        self.is_asked.load(Ordering::Relaxed)
+    }
+}
+
+/// How far a run is: for progress bars and logs.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Progress {
+    pub n_keyframes: usize,
+    pub n_placed: usize,
+    pub n_splats: usize,
+    pub n_steps: u64,
+    pub steps_planned: u64,
+}
+
+/// Wall seconds, summed over the run.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StageSecs {
+    pub wall: f64,
+    pub decode: f64,
+    pub geometry: f64,
+    pub optimise: f64,
+}
+
+/// What a run leaves behind.
+pub struct Outcome {
+    pub snapshot: Arc<Snapshot>,
+    pub map: SplatMap,
+    pub counts: SourceCounts,
+    pub n_dropped: u64,
+    pub n_selected: usize,
+    /// Stamps of all frames that arrived, in order.
+    pub frame_stamps: Vec<Stamp>,
+    /// Ground truth of the keyframes, where the recording has it.
+    pub truth: Vec<(Stamp, Rigid)>,
+    pub secs: StageSecs,
+    /// Seconds from the selection of a keyframe to its pose, and to the first snapshot that has it.
+    pub keyframe_to_pose_secs: Vec<f64>,
+    pub keyframe_to_snapshot_secs: Vec<f64>,
+    /// Why keyframes are missing, in the geometry model's words.
+    pub geometry_note: Option<String>,
+    /// The stage that failed, and how; what was gathered before is kept.
+    pub error: Option<String>,
+    /// Given back so that it can stay up for late joiners.
+    pub subscriber: Option<Box<dyn Subscriber>>,
+}
+
+impl std::fmt::Debug for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Outcome({} of {} keyframes, {:?})", self.snapshot.poses.len(), self.n_selected, self.error)
+    }
+}
+
+/// The geometry model that the parameters name, and where its lengths come from.
+fn model(params: &Params) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
+    match params.geometry.as_str() {
+        "sfm" => Ok((Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)), ScaleSource::UpToScale)),
+        "known" => Ok((Box::new(Known::new(params.known.clone(), params.seed)), ScaleSource::Given)),
+        name if name.starts_with("onnx:") => {
+            bail!("this build has no ONNX Runtime; use --geometry sfm: {name}")
+        }
+        name => bail!("{name:?} is no geometry; expected sfm or known"),
+    }
+}
+
+/// The best engine that the parameters allow.
+pub fn engine(backend: Backend) -> anyhow::Result<Box<dyn Engine>> {
+    match backend {
+        Backend::Auto | Backend::Cpu => Ok(Box::new(CpuEngine::new())),
+        Backend::Wgpu => bail!("this build has no wgpu backend; use --backend cpu or auto"),
+    }
+}
+
+/// Runs a closure on a named thread (at most 15 bytes, as Linux shows them).
+#[expect(clippy::disallowed_types, reason = "the one home of threads")]
+fn spawn<T: Send + 'static>(
+    name: &'static str,
+    body: impl FnOnce() -> T + Send + 'static,
+) -> anyhow::Result<std::thread::JoinHandle<T>> {
+    std::thread::Builder::new().name(name.to_owned()).spawn(body).with_context(|| format!("cannot start thread {name}"))
+}
+
+/// The publisher that the parameters ask for.
+#[cfg(feature = "zenoh")]
+pub fn subscriber(params: &PublishParams) -> anyhow::Result<Option<Box<dyn Subscriber>>> {
+    use crate::publish::zenoh::ZenohPublisher;
+
+    struct Zenoh(ZenohPublisher);
+
+    impl Subscriber for Zenoh {
+        fn publish(&mut self, snapshot: &Arc<Snapshot>) {
+            // A client that is gone or slow must not end the run.
+            if let Err(e) = self.0.publish(snapshot) {
+                tracing::warn!("snapshot {} was not published: {e}", snapshot.revision);
+            }
+        }
+
+        fn close(self: Box<Self>) {
+            if let Err(e) = self.0.close() {
+                tracing::warn!("zenoh did not close cleanly: {e}");
+            }
+        }
+    }
+
+    if !params.zenoh {
+        return Ok(None);
+    }
+    let publisher = ZenohPublisher::open(params)?;
+    tracing::info!("zenoh listens on {}", publisher.endpoints().join(" "));
+    Ok(Some(Box::new(Zenoh(publisher))))
+}
+
+#[cfg(not(feature = "zenoh"))]
+pub fn subscriber(params: &PublishParams) -> anyhow::Result<Option<Box<dyn Subscriber>>> {
+    if params.zenoh {
+        bail!("publish.zenoh is true, but this build has no zenoh; build with --features zenoh");
+    }
+    Ok(None)
+}
+
+/// Keeps the publisher up for late subscribers, then closes it; Ctrl-C cuts the wait short.
+pub fn linger(outcome: &mut Outcome, secs: f64, stop: &Stop) {
+    let Some(subscriber) = outcome.subscriber.take() else { return };
+    let watch = Stopwatch::start();
+    while watch.secs() < secs && !stop.is_asked() {
+        std::thread::sleep(LINGER_TICK);
+    }
+    subscriber.close();
+}

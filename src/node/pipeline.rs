@@ -1,0 +1,279 @@
+//! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
+
+use std::sync::Arc;
+
+use anyhow::anyhow;
+
+use crate::clock::Stopwatch;
+use crate::frame::{Batch, Frame};
+use crate::geometry::{GeometryBatch, GeometryError};
+use crate::map::SplatMap;
+use crate::map::snapshot::Snapshot;
+use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
+use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
+use crate::queue::{Ended, Receiver, Sender, WhenFull, queue};
+use crate::source::SourceCounts;
+
+/// Frames between source and selection.
+const FRAME_QUEUE: usize = 4;
+
+/// What crosses from geometry to the map; no batch at the model's end.
+type Answer = (Option<Arc<Batch>>, GeometryBatch);
+
+/// Takes snapshots on their way out, newest wins.
+pub trait Subscriber: Send {
+    fn publish(&mut self, snapshot: &Arc<Snapshot>);
+
+    fn close(self: Box<Self>);
+}
+
+/// Runs a job to its end. `on_progress` is called on this thread, `subscriber` on its own.
+pub fn run(
+    job: Job,
+    subscriber: Option<Box<dyn Subscriber>>,
+    on_progress: &mut dyn FnMut(Progress),
+) -> anyhow::Result<Outcome> {
+    let watch = Stopwatch::start();
+    let (model, scale) = model(&job.params)?;
+    let n_frames = job.source.len_hint().filter(|n| *n > 0);
+    let map = SplatMap::new(job.params.map.clone(), job.params.seed, scale, engine(job.params.backend)?);
+    let stages = Stages {
+        map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
+        select: SelectStage::new(&job.params),
+        geometry: GeometryStage::new(model),
+        source: SourceStage::new(job.source, job.stop),
+        subscriber,
+    };
+    let ended = if job.params.sequential {
+        stages.in_sequence(on_progress)
+    } else {
+        stages.on_threads(job.is_live, on_progress)?
+    };
+    let mut outcome = ended.into_outcome();
+    outcome.secs.wall = watch.secs();
+    Ok(outcome)
+}
+
+struct Stages {
+    source: SourceStage,
+    select: SelectStage,
+    geometry: GeometryStage,
+    map: MapStage,
+    subscriber: Option<Box<dyn Subscriber>>,
+}
+
+/// All stages after their end.
+struct End {
+    counts: SourceCounts,
+    n_dropped: u64,
+    decode_secs: f64,
+    select: SelectStage,
+    geometry: GeometryStage,
+    map: MapStage,
+    snapshot: Arc<Snapshot>,
+    subscriber: Option<Box<dyn Subscriber>>,
+    error: Option<String>,
+}
+
+impl Stages {
+    /// One thread, stage after stage: for tests and bisecting.
+    fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
+        let mut subscriber = self.subscriber;
+        let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
+            if let Some(subscriber) = &mut subscriber {
+                subscriber.publish(&snapshot);
+            }
+            on_progress(progress);
+        };
+        let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
+        let mut map_batch = |batch: Batch| -> Result<(), GeometryError> {
+            let answer = geometry.infer(&batch)?;
+            map.add(Some(&batch), answer, &mut publish);
+            Ok(())
+        };
+        let mut result = Ok(());
+        while result.is_ok() {
+            let Some(frame) = self.source.next() else { break };
+            result = select.push(frame).map_or(Ok(()), &mut map_batch);
+        }
+        if result.is_ok() {
+            result = select.finish().map_or(Ok(()), &mut map_batch);
+        }
+        let result = result.and_then(|()| {
+            let rest = geometry.finish()?;
+            map.add(None, rest, &mut publish);
+            Ok(())
+        });
+        let snapshot = map.finish(&mut publish);
+        End {
+            counts: self.source.counts(),
+            n_dropped: 0,
+            decode_secs: self.source.decode_secs,
+            select: self.select,
+            geometry: self.geometry,
+            map: self.map,
+            snapshot,
+            subscriber,
+            error: result.err().map(|e| format!("geometry: {e}")),
+        }
+    }
+
+    /// A thread per stage.
+    fn on_threads(self, is_live: bool, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
+        let when_full = if is_live { WhenFull::DropOldest } else { WhenFull::Wait };
+        let (frames_tx, frames) = queue("frames", FRAME_QUEUE, when_full);
+        let (batches_tx, batches) = queue("batches", 1, WhenFull::Wait);
+        let (answers_tx, answers) = queue("answers", 1, WhenFull::Wait);
+        let (snapshots_tx, snapshots) = queue("snapshots", 1, WhenFull::DropOldest);
+        let (progress_tx, progress) = queue("progress", 1, WhenFull::DropOldest);
+
+        let source = spawn("source", move || run_source(self.source, &frames_tx))?;
+        let select = spawn("select", move || run_select(self.select, &frames, &batches_tx))?;
+        let geometry = spawn("geometry", move || run_geometry(self.geometry, &batches, &answers_tx))?;
+        let map = spawn("map", move || {
+            let mut publish = |snapshot, progress| {
+                // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
+                drop(snapshots_tx.send(snapshot));
+                progress_tx.send(progress).ok();
+            };
+            run_map(self.map, is_live, &answers, &mut publish)
+        })?;
+        let publisher = spawn("publish", move || run_publisher(self.subscriber, &snapshots))?;
+
+        while let Some(progress) = progress.recv() {
+            on_progress(progress);
+        }
+        let (source, n_dropped) = joined("source", source)?;
+        let select = joined("select", select)?;
+        let (geometry, error) = joined("geometry", geometry)?;
+        let (map, snapshot) = joined("map", map)?;
+        let subscriber = joined("publish", publisher)?;
+        Ok(End {
+            counts: source.counts(),
+            n_dropped,
+            decode_secs: source.decode_secs,
+            select,
+            geometry,
+            map,
+            snapshot,
+            subscriber,
+            error: error.map(|e| format!("geometry: {e}")),
+        })
+    }
+}
+
+impl End {
+    fn into_outcome(self) -> Outcome {
+        Outcome {
+            snapshot: self.snapshot,
+            counts: self.counts,
+            n_dropped: self.n_dropped,
+            n_selected: self.select.n_selected,
+            frame_stamps: self.select.frame_stamps,
+            truth: self.select.truth,
+            secs: StageSecs {
+                wall: 0.0,
+                decode: self.decode_secs,
+                geometry: self.geometry.secs,
+                optimise: self.map.optimise_secs,
+            },
+            keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
+            keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
+            map: self.map.map,
+            geometry_note: self.geometry.note,
+            error: self.error,
+            subscriber: self.subscriber,
+        }
+    }
+}
+
+fn run_source(mut stage: SourceStage, frames: &Sender<Frame>) -> (SourceStage, u64) {
+    while let Some(frame) = stage.next() {
+        if frames.send(frame).is_err() {
+            break;
+        }
+    }
+    (stage, frames.dropped())
+}
+
+fn run_select(mut stage: SelectStage, frames: &Receiver<Frame>, batches: &Sender<Arc<Batch>>) -> SelectStage {
+    while let Some(frame) = frames.recv() {
+        if let Some(batch) = stage.push(frame)
+            && batches.send(Arc::new(batch)).is_err()
+        {
+            return stage;
+        }
+    }
+    if let Some(batch) = stage.finish() {
+        drop(batches.send(Arc::new(batch)));
+    }
+    stage
+}
+
+fn run_geometry(
+    mut stage: GeometryStage,
+    batches: &Receiver<Arc<Batch>>,
+    answers: &Sender<Answer>,
+) -> (GeometryStage, Option<GeometryError>) {
+    while let Some(batch) = batches.recv() {
+        match stage.infer(&batch) {
+            Ok(geometry) => {
+                if answers.send((Some(batch), geometry)).is_err() {
+                    return (stage, None);
+                }
+            }
+            Err(error) => return (stage, Some(error)),
+        }
+    }
+    match stage.finish() {
+        Ok(geometry) => {
+            drop(answers.send((None, geometry)));
+            (stage, None)
+        }
+        Err(error) => (stage, Some(error)),
+    }
+}
+
+fn run_map(
+    mut stage: MapStage,
+    is_live: bool,
+    answers: &Receiver<Answer>,
+    publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+) -> (MapStage, Arc<Snapshot>) {
+    loop {
+        let answer = if is_live {
+            match answers.try_recv() {
+                Ok(Some(answer)) => Some(answer),
+                Ok(None) if stage.step_while_waiting(publish) => continue,
+                Ok(None) => answers.recv(),
+                Err(Ended) => None,
+            }
+        } else {
+            answers.recv()
+        };
+        let Some((batch, geometry)) = answer else { break };
+        stage.add(batch.as_deref(), geometry, publish);
+    }
+    let snapshot = stage.finish(publish);
+    (stage, snapshot)
+}
+
+fn run_publisher(
+    mut subscriber: Option<Box<dyn Subscriber>>,
+    snapshots: &Receiver<Arc<Snapshot>>,
+) -> Option<Box<dyn Subscriber>> {
+    while let Some(snapshot) = snapshots.recv() {
+        if let Some(subscriber) = &mut subscriber {
+            subscriber.publish(&snapshot);
+        }
+    }
+    subscriber
+}
+
+fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
+    thread.join().map_err(|panic| {
+        let text = panic.downcast_ref::<String>().cloned();
+        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));
+        anyhow!("stage {name} broke: {}", text.unwrap_or_default())
+    })
+}

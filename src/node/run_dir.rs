@@ -1,0 +1,228 @@
+//! The outcome of a run -> its directory: trajectories, map, checkpoint, report, log.
+//!
+//! Every file is written whole or not at all, and one that fails keeps none of the others from being written.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use anyhow::Context;
+use tracing_subscriber::filter::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{Layer, fmt as log_format};
+
+use crate::clock::Stamp;
+use crate::config::Settings;
+use crate::eval::comparisons::Comparison;
+use crate::eval::html::{ReportInputs, write_html};
+use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib};
+use crate::eval::trajectory::{TimedPose, write_tum};
+use crate::eval::image_metrics;
+use crate::export::ply;
+use crate::map::checkpoint::{self, Checkpoint};
+use crate::map::layout::map_sha256;
+use crate::map::snapshot::Snapshot;
+use crate::node::Outcome;
+
+/// Training views whose quality is measured: enough for a mean, few enough for long recordings.
+const MAX_TRAIN_VIEWS: usize = 24;
+/// Pictures in the report.
+const MAX_HELD_OUT_PICTURES: usize = 8;
+const MAX_TRAIN_PICTURES: usize = 4;
+
+/// Makes the directory and checks, before any work is done, that it can be written to.
+pub fn prepare(out: &Path) -> anyhow::Result<()> {
+    let probe = out.join(".writable");
+    fs::create_dir_all(out)
+        .and_then(|()| fs::write(&probe, b"x"))
+        .and_then(|()| fs::remove_file(&probe))
+        .with_context(|| format!("cannot write the run directory; name another with --out: {}", out.display()))
+}
+
+/// Log lines go to `run.log` and to stderr; a terminal with a progress bar gets warnings only.
+pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
+    let filter = |level: &str| {
+        EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("warn,splat_mapper={level}")))
+    };
+    let stderr = log_format::layer()
+        .with_writer(std::io::stderr)
+        .with_ansi(is_terminal)
+        .with_target(false)
+        .with_filter(filter(if is_terminal { "warn" } else { "info" }));
+    let file = match out {
+        None => None,
+        Some(out) => {
+            let path = out.join("run.log");
+            let file = fs::File::create(&path).with_context(|| format!("cannot write the log: {}", path.display()))?;
+            let layer = log_format::layer().with_writer(Mutex::new(file)).with_ansi(false).with_target(false);
+            Some(layer.with_filter(filter("info")))
+        }
+    };
+    // A second start in one process (tests) keeps the first log.
+    tracing_subscriber::registry().with(stderr).with(file).try_init().ok();
+    Ok(())
+}
+
+/// Measures quality and writes the directory; returns what to tell the user.
+pub fn finish(
+    outcome: &mut Outcome,
+    settings: &Settings,
+    out: Option<&Path>,
+    input: &str,
+) -> anyhow::Result<String> {
+    let params = settings.params()?;
+    let (quality, comparisons) = match out {
+        Some(_) => measure_quality(outcome, params.map.holdout),
+        None => (Quality::default(), Vec::new()),
+    };
+    let report = report(outcome, settings, quality);
+    if let Some(out) = out {
+        write(outcome, &report, &comparisons, out, input)?;
+    }
+    Ok(summary(&report, out))
+}
+
+fn write(
+    outcome: &Outcome,
+    report: &Report,
+    comparisons: &[Comparison],
+    out: &Path,
+    input: &str,
+) -> anyhow::Result<()> {
+    let snapshot = &outcome.snapshot;
+    let keyframes = timed_keyframes(snapshot);
+    let frames = interpolate(&keyframes, &outcome.frame_stamps);
+    let truth: Vec<TimedPose> = outcome.truth.iter().map(|(stamp, pose)| TimedPose { stamp: *stamp, pose: *pose }).collect();
+    let page = ReportInputs {
+        title: input,
+        report,
+        comparisons,
+        loss: outcome.map.loss_curve(),
+        psnr: &[],
+        keyframes: &keyframes,
+        trajectory: &frames,
+        reference: &truth,
+    };
+    let checkpoint =
+        Checkpoint { snapshot: (**snapshot).clone(), seed: report.seed, steps: outcome.map.n_steps() };
+    let results: [anyhow::Result<()>; 6] = [
+        write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
+        write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
+        ply::write(&snapshot.splats, &out.join("map.ply")).map_err(Into::into),
+        checkpoint::write(&checkpoint, &out.join("map.splatmap")).map_err(Into::into),
+        report.write(&out.join("report.json")).map_err(Into::into),
+        write_html(&page, &out.join("report.html")).map_err(Into::into),
+    ];
+    results.into_iter().collect()
+}
+
+fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
+    let snapshot = &outcome.snapshot;
+    let parameters: BTreeMap<String, serde_json::Value> =
+        settings.entries().map(|(key, value)| (key.to_owned(), value.clone())).collect();
+    let optimise = outcome.secs.optimise;
+    let steps = outcome.map.n_steps();
+    Report {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        frames: FrameCounts::of(&outcome.counts, outcome.n_dropped),
+        keyframes: KeyframeCounts {
+            selected: outcome.n_selected as u64,
+            registered: snapshot.poses.len() as u64,
+            components: outcome.map.components().len() as u64,
+        },
+        splats: snapshot.splats.len() as u64,
+        steps,
+        adapter: outcome.map.adapter(),
+        seed: parameters.get("seed").and_then(serde_json::Value::as_u64).unwrap_or_default(),
+        map_sha256: map_sha256(&snapshot.splats),
+        timing_s: Timing {
+            wall: outcome.secs.wall,
+            decode: outcome.secs.decode,
+            geometry: outcome.secs.geometry,
+            optimise,
+        },
+        steps_per_s: (steps > 0 && optimise > 0.0).then(|| steps as f64 / optimise),
+        latency_ms: Latency::of(&outcome.keyframe_to_pose_secs, &outcome.keyframe_to_snapshot_secs),
+        peak_rss_mib: peak_rss_mib(),
+        peak_gpu_mib: None,
+        quality,
+        scale: Scale::of(snapshot.scale),
+        source_fault: outcome.counts.fault.clone(),
+        geometry_note: outcome.geometry_note.clone(),
+        error: outcome.error.clone(),
+        parameters,
+    }
+}
+
+/// PSNR over held-out and some training views, and the pictures for the report.
+fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<Comparison>) {
+    let ids = outcome.map.keyframe_ids();
+    let (held_out, train): (Vec<u32>, Vec<u32>) = {
+        let (held_out, train): (Vec<_>, Vec<_>) = ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
+        (held_out.into_iter().map(|k| k.0).collect(), train.into_iter().map(|k| k.0).collect())
+    };
+    let stride = train.len().div_ceil(MAX_TRAIN_VIEWS).max(1);
+    let train: Vec<u32> = train.into_iter().step_by(stride).collect();
+    let mut pictures = Vec::new();
+    let mut measure = |ids: &[u32], is_held_out: bool, max_pictures: usize| {
+        let picture_stride = ids.len().div_ceil(max_pictures).max(1);
+        let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
+        for (i, id) in ids.iter().enumerate() {
+            let Some((rendering, photo)) = outcome.map.render_keyframe(*id) else { continue };
+            let psnr = image_metrics::psnr(&rendering.rgb, &photo);
+            psnrs.push(psnr);
+            ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
+            if i % picture_stride == 0 {
+                pictures.push(Comparison { keyframe_id: *id, held_out: is_held_out, photo, rendering, psnr });
+            }
+        }
+        (mean(&psnrs), mean(&ssims))
+    };
+    let (psnr_holdout, ssim_holdout) = measure(&held_out, true, MAX_HELD_OUT_PICTURES);
+    let (psnr_train, _) = measure(&train, false, MAX_TRAIN_PICTURES);
+    let quality = Quality {
+        holdout_every: u64::from(holdout_every),
+        psnr_train,
+        psnr_holdout,
+        ssim_holdout,
+        lpips_holdout: None,
+    };
+    (quality, pictures)
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+fn timed_keyframes(snapshot: &Arc<Snapshot>) -> Vec<TimedPose> {
+    let timed = |pose: &crate::map::snapshot::KeyframePose| TimedPose { stamp: pose.stamp, pose: pose.map_from_cam };
+    snapshot.poses.iter().map(timed).collect()
+}
+
+/// Poses of all frames between the first and the last keyframe: linear between neighbouring keyframes. Frames
+/// outside have no pose, rather than a guessed one.
+fn interpolate(keyframes: &[TimedPose], stamps: &[Stamp]) -> Vec<TimedPose> {
+    let pose_at = |stamp: Stamp| {
+        let after = keyframes.partition_point(|k| k.stamp < stamp);
+        let next = keyframes.get(after)?;
+        if next.stamp == stamp {
+            return Some(next.pose);
+        }
+        let last = &keyframes[after.checked_sub(1)?];
+        let share = stamp.secs_since(last.stamp) / next.stamp.secs_since(last.stamp);
+        Some(last.pose.between(&next.pose, share))
+    };
+    stamps.iter().filter_map(|stamp| Some(TimedPose { stamp: *stamp, pose: pose_at(*stamp)? })).collect()
+}
+
+fn summary(report: &Report, out: Option<&Path>) -> String {
+    let keyframes = &report.keyframes;
+    let quality = report.quality.psnr_holdout.map(|psnr| format!(", {psnr:.2} dB on held-out views")).unwrap_or_default();
+    let place = out.map(|out| format!(": {}", out.join("report.html").display())).unwrap_or_default();
+    format!(
+        "{} of {} keyframes in {} component(s), {} splats, {} steps in {:.0} s{quality}{place}",
+        keyframes.registered, keyframes.selected, keyframes.components, report.splats, report.steps, report.timing_s.wall
+    )
+}

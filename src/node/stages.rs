@@ -1,0 +1,269 @@
+//! The stages between the queues: each is a struct with push-like methods and knows no threads.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use crate::clock::{Stamp, Stopwatch};
+use crate::config::{MapParams, Params};
+use crate::frame::{Batch, Frame};
+use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
+use crate::map::SplatMap;
+use crate::map::schedule::{self, Phase};
+use crate::map::snapshot::Snapshot;
+use crate::node::{Progress, Stop};
+use crate::pose::Rigid;
+use crate::select::{Batcher, Selector};
+use crate::source::{Source, SourceCounts};
+
+/// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
+const MAX_STAMPS: usize = 10_000_000;
+/// Steps between looks at the clock, the queue and the stop.
+const STEPS_AT_ONCE: u64 = 10;
+/// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
+const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
+
+/// Input -> frames.
+pub(super) struct SourceStage {
+    source: Box<dyn Source>,
+    stop: Stop,
+    pub(super) decode_secs: f64,
+}
+
+/// Frames -> batches.
+#[derive(Debug)]
+pub(super) struct SelectStage {
+    selector: Selector,
+    batcher: Batcher,
+    pub(super) n_selected: usize,
+    pub(super) frame_stamps: Vec<Stamp>,
+    pub(super) truth: Vec<(Stamp, Rigid)>,
+}
+
+/// Batches -> geometry.
+pub(super) struct GeometryStage {
+    model: Box<dyn GeometryModel>,
+    pub(super) secs: f64,
+    pub(super) note: Option<String>,
+}
+
+/// Geometry -> the map, its steps and its snapshots.
+pub(super) struct MapStage {
+    pub(super) map: SplatMap,
+    params: MapParams,
+    is_live: bool,
+    stop: Stop,
+    n_frames: Option<u64>,
+    /// Age of keyframes that no snapshot has shown.
+    unpublished: BTreeMap<u32, Stopwatch>,
+    since_snapshot: Stopwatch,
+    n_keyframes: usize,
+    pub(super) optimise_secs: f64,
+    pub(super) keyframe_to_pose_secs: Vec<f64>,
+    pub(super) keyframe_to_snapshot_secs: Vec<f64>,
+}
+
+impl SourceStage {
+    pub(super) fn new(source: Box<dyn Source>, stop: Stop) -> Self {
+        Self { source, stop, decode_secs: 0.0 }
+    }
+
+    pub(super) fn next(&mut self) -> Option<Frame> {
+        if self.stop.is_asked() {
+            return None;
+        }
+        let watch = Stopwatch::start();
+        let frame = self.source.next();
+        self.decode_secs += watch.secs();
+        frame
+    }
+
+    pub(super) fn counts(&self) -> SourceCounts {
+        self.source.counts()
+    }
+}
+
+impl SelectStage {
+    pub(super) fn new(params: &Params) -> Self {
+        Self {
+            selector: Selector::new(params.select.clone()),
+            batcher: Batcher::new(&params.select),
+            n_selected: 0,
+            frame_stamps: Vec::new(),
+            truth: Vec::new(),
+        }
+    }
+
+    pub(super) fn push(&mut self, frame: Frame) -> Option<Batch> {
+        if self.frame_stamps.len() < MAX_STAMPS {
+            self.frame_stamps.push(frame.stamp);
+        }
+        let keyframe = self.selector.push(frame)?;
+        self.n_selected += 1;
+        if let Some(truth) = keyframe.frame.truth {
+            self.truth.push((keyframe.frame.stamp, truth));
+        }
+        self.batcher.push(keyframe)
+    }
+
+    pub(super) fn finish(&mut self) -> Option<Batch> {
+        self.batcher.finish()
+    }
+}
+
+impl GeometryStage {
+    pub(super) fn new(model: Box<dyn GeometryModel>) -> Self {
+        Self { model, secs: 0.0, note: None }
+    }
+
+    pub(super) fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
+        let watch = Stopwatch::start();
+        let geometry = self.model.infer(batch);
+        self.account(&watch, geometry)
+    }
+
+    pub(super) fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
+        let watch = Stopwatch::start();
+        let geometry = self.model.finish();
+        self.account(&watch, geometry)
+    }
+
+    fn account(
+        &mut self,
+        watch: &Stopwatch,
+        geometry: Result<GeometryBatch, GeometryError>,
+    ) -> Result<GeometryBatch, GeometryError> {
+        self.secs += watch.secs();
+        if let Ok(geometry) = &geometry {
+            tracing::info!(
+                "batch {}: {} views, {} revised{}",
+                geometry.batch_id,
+                geometry.views.len(),
+                geometry.revised.len(),
+                geometry.note.as_ref().map(|n| format!(", {n}")).unwrap_or_default()
+            );
+            self.note = geometry.note.clone().or(self.note.take());
+        }
+        geometry
+    }
+}
+
+impl MapStage {
+    pub(super) fn new(map: SplatMap, params: &Params, is_live: bool, stop: Stop, n_frames: Option<u64>) -> Self {
+        Self {
+            map,
+            params: params.map.clone(),
+            is_live,
+            stop,
+            n_frames,
+            unpublished: BTreeMap::new(),
+            since_snapshot: Stopwatch::start(),
+            n_keyframes: 0,
+            optimise_secs: 0.0,
+            keyframe_to_pose_secs: Vec::new(),
+            keyframe_to_snapshot_secs: Vec::new(),
+        }
+    }
+
+    /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end.
+    pub(super) fn add(
+        &mut self,
+        batch: Option<&Batch>,
+        geometry: GeometryBatch,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) {
+        let newest = batch.and_then(|b| b.keyframes.last()).map(|k| k.frame.seq + 1);
+        let progress = self.n_frames.zip(newest).map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
+        for keyframe in batch.iter().flat_map(|b| &b.keyframes) {
+            self.n_keyframes = self.n_keyframes.max(keyframe.id as usize + 1);
+            if !self.map.has_keyframe(keyframe.id) {
+                self.unpublished.insert(keyframe.id, keyframe.age);
+            }
+        }
+        let watch = Stopwatch::start();
+        for id in self.map.add(batch, geometry, progress) {
+            if let Some(age) = self.unpublished.get(&id) {
+                self.keyframe_to_pose_secs.push(age.secs());
+            }
+        }
+        self.optimise_secs += watch.secs();
+        if !self.is_live {
+            let due = schedule::due(&self.params, progress.unwrap_or(0.0));
+            self.step_until(due, publish);
+        }
+    }
+
+    /// Live: a few steps, if any are left to make. Returns whether some were made.
+    pub(super) fn step_while_waiting(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) -> bool {
+        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.keyframe_ids().len() as u64;
+        let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
+        let before = self.map.n_steps();
+        self.step_until(target, publish);
+        self.map.n_steps() > before
+    }
+
+    /// The steps after the last keyframe, the poses of held-out views, and the last snapshot.
+    pub(super) fn finish(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) -> Arc<Snapshot> {
+        let watch = Stopwatch::start();
+        let (first, last) = (self.map.n_steps(), self.params.steps);
+        while !self.stop.is_asked() && self.map.n_steps() < last {
+            let share = (self.map.n_steps() - first) as f32 / (last - first) as f32;
+            let n = STEPS_AT_ONCE.min(last - self.map.n_steps());
+            if self.map.step(n, Phase::Final(share)) == 0 {
+                break;
+            }
+            self.snapshot_if_due(publish);
+        }
+        if !self.stop.is_asked() {
+            self.map.refine_held_out();
+        }
+        self.optimise_secs += watch.secs();
+        let snapshot = self.snapshot();
+        publish(Arc::clone(&snapshot), self.progress());
+        snapshot
+    }
+
+    fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+        let watch = Stopwatch::start();
+        while self.map.n_steps() < target && !self.stop.is_asked() {
+            let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
+            if self.map.step(n, Phase::Streaming) == 0 {
+                break;
+            }
+            self.snapshot_if_due(publish);
+        }
+        self.optimise_secs += watch.secs();
+        self.snapshot_if_due(publish);
+    }
+
+    fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+        if self.since_snapshot.secs() >= self.params.snapshot_secs && self.map.n_splats() > 0 {
+            let snapshot = self.snapshot();
+            publish(snapshot, self.progress());
+        }
+    }
+
+    fn snapshot(&mut self) -> Arc<Snapshot> {
+        let snapshot = self.map.snapshot();
+        self.since_snapshot = Stopwatch::start();
+        for pose in &snapshot.poses {
+            if let Some(age) = self.unpublished.remove(&pose.keyframe_id) {
+                self.keyframe_to_snapshot_secs.push(age.secs());
+            }
+        }
+        // Keyframes that never get a pose must not pile up.
+        while self.unpublished.len() > crate::map::MAX_WAITING {
+            self.unpublished.pop_first();
+        }
+        snapshot
+    }
+
+    fn progress(&self) -> Progress {
+        Progress {
+            n_keyframes: self.n_keyframes,
+            n_placed: self.map.keyframe_ids().len(),
+            n_splats: self.map.n_splats(),
+            n_steps: self.map.n_steps(),
+            steps_planned: if self.is_live { 0 } else { self.params.steps },
+        }
+    }
+}

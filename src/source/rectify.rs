@@ -1,0 +1,181 @@
+//! Picture through a real lens -> picture of a pinhole, by a table made once per lens and size.
+//!
+//! The pinhole keeps the size and the ratio of focal lengths, and has the widest view of which every pixel lies in
+//! the lens's picture: no black corners. It looks at the centre of the undistorted picture.
+
+use glam::DVec2;
+use kornia_image::{Image, ImageSize};
+use kornia_imgproc::interpolation::{InterpolationMode, remap_u8};
+
+use crate::camera::{Distortion, Intrinsics, Lens};
+use crate::frame::RgbImage;
+
+/// Tangent of the widest half view of the pinhole (60 deg): beyond it a fisheye's rim would be smeared over most
+/// of the picture.
+const MAX_HALF_VIEW: f64 = 1.732;
+/// Points of the rim that are checked per side of the picture.
+const RIM_POINTS: u32 = 96;
+/// A pinhole that would show less than this share of the lens's view means a calibration that does not fit.
+const MIN_VIEW_SHARE: f64 = 0.2;
+
+pub struct Rectifier {
+    /// The camera of the pictures that come out.
+    pub pinhole: Intrinsics,
+    map_x: Image<f32, 1>,
+    map_y: Image<f32, 1>,
+}
+
+impl std::fmt::Debug for Rectifier {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Rectifier")
+            .field("pinhole", &self.pinhole)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Rectifier {
+    /// `None` when the coefficients leave no usable view: such a calibration is wrong.
+    pub fn new(lens: &Lens) -> Option<Self> {
+        let pinhole = widest_pinhole(lens)?;
+        let (width, height) = (pinhole.width_px as usize, pinhole.height_px as usize);
+        let mut xs = Vec::with_capacity(width * height);
+        let mut ys = Vec::with_capacity(width * height);
+        for y in 0..pinhole.height_px {
+            for x in 0..pinhole.width_px {
+                let at = lens.project(
+                    pinhole.ray_in_cam(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5)),
+                )?;
+                // The table counts pixel centres at integers. The rim is within a rounding error of the picture's.
+                xs.push((at.x - 0.5).clamp(0.0, f64::from(pinhole.width_px - 1)) as f32);
+                ys.push((at.y - 0.5).clamp(0.0, f64::from(pinhole.height_px - 1)) as f32);
+            }
+        }
+        let size = ImageSize { width, height };
+        Some(Self {
+            pinhole,
+            map_x: Image::new(size, xs).ok()?,
+            map_y: Image::new(size, ys).ok()?,
+        })
+    }
+
+    /// The picture must have the size of the lens.
+    pub fn rectify(&self, picture: RgbImage) -> RgbImage {
+        let (width_px, height_px) = (self.pinhole.width_px, self.pinhole.height_px);
+        assert_eq!(
+            (picture.width_px, picture.height_px),
+            (width_px, height_px),
+            "table for another size"
+        );
+        let size = self.map_x.size();
+        let source = Image::<u8, 3>::new(size, picture.pixels).expect("pixels fit the size");
+        let mut target = Image::<u8, 3>::from_size_val(size, 0).expect("memory for one picture");
+        remap_u8(
+            &source,
+            &mut target,
+            &self.map_x,
+            &self.map_y,
+            InterpolationMode::Bilinear,
+        )
+        .expect("sizes agree and bilinear is supported");
+        RgbImage {
+            width_px,
+            height_px,
+            pixels: target.into_vec(),
+        }
+    }
+
+    /// Where a pixel of the pinhole's picture lies in the lens's picture, in pixels with centres at +0.5.
+    pub fn source_of(&self, x: u32, y: u32) -> DVec2 {
+        let ix = y as usize * self.pinhole.width_px as usize + x as usize;
+        DVec2::new(
+            f64::from(self.map_x.as_slice()[ix]) + 0.5,
+            f64::from(self.map_y.as_slice()[ix]) + 0.5,
+        )
+    }
+}
+
+fn widest_pinhole(lens: &Lens) -> Option<Intrinsics> {
+    let source = &lens.intrinsics;
+    let max_radius = lens.distortion.max_radius();
+    let (low, high) = inner_view(lens, max_radius)?;
+    let (width, height) = (f64::from(source.width_px), f64::from(source.height_px));
+    let centre = (low + high) * 0.5;
+    let at_scale = |scale: f64| {
+        let (fx, fy) = (source.fx * scale, source.fy * scale);
+        let (cx, cy) = (width * 0.5 - fx * centre.x, height * 0.5 - fy * centre.y);
+        Intrinsics {
+            fx,
+            fy,
+            cx,
+            cy,
+            ..*source
+        }
+    };
+    // Focal lengths only grow from the smallest that the inner view and the limit of the view allow.
+    let half = ((high - low) * 0.5).min(DVec2::splat(MAX_HALF_VIEW));
+    let smallest = (width * 0.5 / half.x / source.fx).max(height * 0.5 / half.y / source.fy) * 0.8;
+    let largest = 1.0 / MIN_VIEW_SHARE;
+    let fits = |scale: f64| sees_only_picture(lens, &at_scale(scale), max_radius);
+    if !(smallest.is_finite() && smallest > 0.0 && fits(largest.max(smallest))) {
+        return None;
+    }
+    let (mut too_wide, mut fitting) = (smallest, largest.max(smallest));
+    for _ in 0..40 {
+        let middle = 0.5 * (too_wide + fitting);
+        if fits(middle) {
+            fitting = middle;
+        } else {
+            too_wide = middle;
+        }
+    }
+    // One ten-thousandth keeps the rim off the last half pixel after rounding.
+    Some(at_scale(fitting * 1.0001))
+}
+
+/// Corners on the plane z = 1 of a box about the axis whose sides the lens's picture reaches everywhere.
+fn inner_view(lens: &Lens, max_radius: f64) -> Option<(DVec2, DVec2)> {
+    let i = &lens.intrinsics;
+    let (right, bottom) = (f64::from(i.width_px) - 0.5, f64::from(i.height_px) - 0.5);
+    let (mut low, mut high) = (DVec2::splat(-MAX_HALF_VIEW), DVec2::splat(MAX_HALF_VIEW));
+    let mut n_seen = 0;
+    for step in 0..=RIM_POINTS {
+        let share = f64::from(step) / f64::from(RIM_POINTS);
+        let (x, y) = (0.5 + share * (right - 0.5), 0.5 + share * (bottom - 0.5));
+        let ray = |x: f64, y: f64| {
+            let ray = lens.ray_in_cam(DVec2::new(x, y))?.truncate();
+            (ray.length() <= max_radius).then_some(ray)
+        };
+        let sides = [ray(0.5, y), ray(x, 0.5), ray(right, y), ray(x, bottom)];
+        n_seen += sides.iter().flatten().count();
+        // Pixels that no ray in front of the camera reaches set no limit: the view ends before them.
+        low.x = sides[0].map_or(low.x, |ray| low.x.max(ray.x));
+        low.y = sides[1].map_or(low.y, |ray| low.y.max(ray.y));
+        high.x = sides[2].map_or(high.x, |ray| high.x.min(ray.x));
+        high.y = sides[3].map_or(high.y, |ray| high.y.min(ray.y));
+    }
+    let is_fisheye = matches!(lens.distortion, Distortion::Equidistant(_));
+    ((n_seen > 0 || is_fisheye) && low.x < high.x && low.y < high.y).then_some((low, high))
+}
+
+/// Whether every ray of the pinhole's rim lands in the lens's picture, and on the near side of a fold.
+fn sees_only_picture(lens: &Lens, pinhole: &Intrinsics, max_radius: f64) -> bool {
+    let (right, bottom) = (
+        f64::from(pinhole.width_px) - 0.5,
+        f64::from(pinhole.height_px) - 0.5,
+    );
+    (0..=RIM_POINTS).all(|step| {
+        let share = f64::from(step) / f64::from(RIM_POINTS);
+        let (x, y) = (0.5 + share * (right - 0.5), 0.5 + share * (bottom - 0.5));
+        [(0.5, y), (x, 0.5), (right, y), (x, bottom)]
+            .into_iter()
+            .all(|(x, y)| {
+                let ray = pinhole.ray_in_cam(DVec2::new(x, y));
+                ray.truncate().length() <= max_radius
+                    && ray.x.abs() <= MAX_HALF_VIEW * 1.001
+                    && ray.y.abs() <= MAX_HALF_VIEW * 1.001
+                    && lens.project(ray).is_some_and(|at| {
+                        at.x >= 0.5 && at.y >= 0.5 && at.x <= right && at.y <= bottom
+                    })
+            })
+    })
+}

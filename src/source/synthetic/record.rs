@@ -1,0 +1,312 @@
+//! Takes -> recordings: an MCAP file of ROS 2 messages with pictures, calibration, exact poses and depth.
+//!
+//! The file appears under its name only when it is whole. Depth has the pixels of the picture as filmed, distortion
+//! included, at a quarter of its size, as the drivers of depth cameras register it.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io::{BufWriter, Seek, Write};
+use std::path::{Path, PathBuf};
+
+use image::ExtendedColorType;
+use image::codecs::jpeg::JpegEncoder;
+use mcap::records::MessageHeader;
+use serde::Serialize;
+
+use crate::camera::{Distortion, Lens};
+use crate::frame::DepthMap;
+use crate::ros::{
+    self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped, TfMessage,
+    TransformStamped,
+};
+
+use super::take::Take;
+use super::{SynthError, SynthSettings};
+
+const WORLD: &str = "map";
+const CAMERA: &str = "camera_optical";
+
+/// Depth pictures have one pixel for so many of the colour picture, along each side.
+const DEPTH_DIVISOR: u32 = 4;
+
+/// What a recording came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SynthSummary {
+    pub n_frames: u32,
+    pub n_messages: u64,
+    pub bytes: u64,
+}
+
+/// Films everything into `out`, and the poses into a TUM file of the same name beside it.
+pub fn write_recording(settings: &SynthSettings, out: &Path) -> Result<SynthSummary, SynthError> {
+    write_recording_with(settings, out, |_| {})
+}
+
+/// The same; `on_frame` hears the number of frames done after each one.
+pub fn write_recording_with(
+    settings: &SynthSettings,
+    out: &Path,
+    mut on_frame: impl FnMut(u32),
+) -> Result<SynthSummary, SynthError> {
+    let take = Take::new(settings.clone())?;
+    let part = with_suffix(out, "part");
+    let written = record(&take, &part, &mut on_frame);
+    let n_messages = match written {
+        Ok(n_messages) => n_messages,
+        Err(reason) => {
+            // The half file is of no use; that it cannot be removed either says nothing new.
+            fs::remove_file(&part).ok();
+            return Err(SynthError::Write {
+                what: "write",
+                reason,
+                path: out.to_owned(),
+            });
+        }
+    };
+    let failed = |what: &'static str, path: &Path| {
+        let path = path.to_owned();
+        move |e: std::io::Error| SynthError::Write {
+            what,
+            reason: e.to_string(),
+            path,
+        }
+    };
+    fs::rename(&part, out).map_err(failed("rename", out))?;
+    let tum = out.with_extension("tum");
+    fs::write(&tum, tum_lines(&take)).map_err(failed("write the poses beside", &tum))?;
+    let bytes = fs::metadata(out).map_err(failed("read back", out))?.len();
+    Ok(SynthSummary {
+        n_frames: settings.n_frames,
+        n_messages,
+        bytes,
+    })
+}
+
+/// The exact trajectory as TUM lines, camera to world: `stamp tx ty tz qx qy qz qw`.
+pub fn truth_tum(settings: &SynthSettings) -> Result<String, SynthError> {
+    Ok(tum_lines(&Take::new(settings.clone())?))
+}
+
+fn tum_lines(take: &Take) -> String {
+    let mut lines = String::from(
+        "# timestamp tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)\n",
+    );
+    for ix in 0..take.settings().n_frames {
+        let pose = take.pose(ix);
+        let (t, q) = (pose.translation, pose.rotation);
+        let stamp = take.stamp(ix);
+        writeln!(
+            lines,
+            "{stamp} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}",
+            t.x, t.y, t.z, q.x, q.y, q.z, q.w
+        )
+        .expect("a String takes everything");
+    }
+    lines
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".");
+    name.push(suffix);
+    path.with_file_name(name)
+}
+
+/// One topic of the file under way.
+#[derive(Debug, Clone, Copy)]
+struct Topic {
+    channel_id: u16,
+    sequence: u32,
+}
+
+struct Recorder<W: Write + Seek> {
+    file: mcap::Writer<W>,
+    n_messages: u64,
+}
+
+impl<W: Write + Seek> Recorder<W> {
+    fn topic<T: Message>(&mut self, name: &str) -> Result<Topic, String> {
+        let schema = self
+            .file
+            .add_schema(T::TYPE_NAME, "ros2msg", T::DEFINITION.as_bytes());
+        let schema = schema.map_err(|e| e.to_string())?;
+        let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), String::new())]);
+        let channel_id = self
+            .file
+            .add_channel(schema, name, "cdr", &metadata)
+            .map_err(|e| e.to_string())?;
+        Ok(Topic {
+            channel_id,
+            sequence: 0,
+        })
+    }
+
+    fn write<T: Message + Serialize>(
+        &mut self,
+        topic: &mut Topic,
+        nanos: u64,
+        message: &T,
+    ) -> Result<(), String> {
+        let payload = ros::encode(message).map_err(|e| e.to_string())?;
+        let header = MessageHeader {
+            channel_id: topic.channel_id,
+            sequence: topic.sequence,
+            log_time: nanos,
+            publish_time: nanos,
+        };
+        topic.sequence += 1;
+        self.n_messages += 1;
+        self.file
+            .write_to_known_channel(&header, &payload)
+            .map_err(|e| e.to_string())
+    }
+}
+
+fn record(take: &Take, path: &Path, on_frame: &mut impl FnMut(u32)) -> Result<u64, String> {
+    let file = BufWriter::new(File::create(path).map_err(|e| e.to_string())?);
+    let options = mcap::WriteOptions::new()
+        .profile("ros2")
+        .library(concat!("splat-mapper ", env!("CARGO_PKG_VERSION")))
+        .compression(Some(mcap::Compression::Zstd))
+        // One thread: the bytes must not depend on the machine.
+        .compression_threads(0);
+    let mut out = Recorder {
+        file: options.create(file).map_err(|e| e.to_string())?,
+        n_messages: 0,
+    };
+    let mut pictures = out.topic::<CompressedImage>("/camera/image_raw/compressed")?;
+    let mut calibration = out.topic::<CameraInfo>("/camera/camera_info")?;
+    let mut tf = out.topic::<TfMessage>("/tf")?;
+    let mut poses = out.topic::<PoseStamped>("/ground_truth/pose")?;
+    let mut depths = if take.settings().depth {
+        Some(out.topic::<Image>("/camera/depth")?)
+    } else {
+        None
+    };
+    let lens = take.settings().lens();
+    for ix in 0..take.settings().n_frames {
+        let stamp = take.stamp(ix);
+        let nanos = u64::try_from(stamp.nanos)
+            .map_err(|e| format!("stamp {stamp} lies before the epoch: {e}"))?;
+        let header = |frame_id: &str| Header {
+            stamp: stamp.into(),
+            frame_id: frame_id.to_owned(),
+        };
+        let pose = take.pose(ix).into();
+        out.write(&mut calibration, nanos, &camera_info(&lens, header(CAMERA)))?;
+        let transform = TransformStamped {
+            header: header(WORLD),
+            child_frame_id: CAMERA.to_owned(),
+            transform: pose,
+        };
+        out.write(
+            &mut tf,
+            nanos,
+            &TfMessage {
+                transforms: vec![transform],
+            },
+        )?;
+        out.write(
+            &mut poses,
+            nanos,
+            &PoseStamped {
+                header: header(WORLD),
+                pose,
+            },
+        )?;
+        if let Some(depths) = &mut depths {
+            out.write(
+                depths,
+                nanos,
+                &depth_image(&small_depth(take, ix, &lens), header(CAMERA)),
+            )?;
+        }
+        let picture = CompressedImage {
+            header: header(CAMERA),
+            format: "jpeg".to_owned(),
+            data: jpeg(take, ix)?,
+        };
+        out.write(&mut pictures, nanos, &picture)?;
+        on_frame(ix + 1);
+    }
+    out.file.finish().map_err(|e| e.to_string())?;
+    let n_messages = out.n_messages;
+    let mut file = out.file.into_inner();
+    file.flush().map_err(|e| e.to_string())?;
+    file.get_ref().sync_all().map_err(|e| e.to_string())?;
+    Ok(n_messages)
+}
+
+fn jpeg(take: &Take, ix: u32) -> Result<Vec<u8>, String> {
+    let picture = take.picture(ix);
+    let mut data = Vec::new();
+    JpegEncoder::new_with_quality(&mut data, take.settings().jpeg_quality)
+        .encode(
+            &picture.pixels,
+            picture.width_px,
+            picture.height_px,
+            ExtendedColorType::Rgb8,
+        )
+        .map_err(|e| e.to_string())?;
+    Ok(data)
+}
+
+fn small_depth(take: &Take, ix: u32, lens: &Lens) -> DepthMap {
+    let (width, height) = (lens.intrinsics.width_px, lens.intrinsics.height_px);
+    let intrinsics = lens.intrinsics.resized(
+        width.div_ceil(DEPTH_DIVISOR),
+        height.div_ceil(DEPTH_DIVISOR),
+    );
+    take.depth_through(
+        ix,
+        &Lens {
+            intrinsics,
+            distortion: lens.distortion,
+        },
+    )
+}
+
+/// Millimetres in 16 bits, as depth cameras send them; 0 where nothing is, or nothing within 65 m.
+fn depth_image(map: &DepthMap, header: Header) -> Image {
+    let millimetres = |depth: &f32| {
+        let value = (1000.0 * depth).round();
+        if value <= 65_535.0 { value as u16 } else { 0 }
+    };
+    Image {
+        header,
+        height: map.height_px,
+        width: map.width_px,
+        encoding: "16UC1".to_owned(),
+        is_bigendian: 0,
+        step: 2 * map.width_px,
+        data: map
+            .depth
+            .iter()
+            .flat_map(|depth| millimetres(depth).to_le_bytes())
+            .collect(),
+    }
+}
+
+/// ROS counts pixel centres at integers, half a pixel less than we do.
+fn camera_info(lens: &Lens, header: Header) -> CameraInfo {
+    let i = lens.intrinsics;
+    let (cx, cy) = (i.cx - 0.5, i.cy - 0.5);
+    let (distortion_model, d) = match lens.distortion {
+        Distortion::None => ("plumb_bob", vec![0.0; 5]),
+        Distortion::PlumbBob(d) => ("plumb_bob", d.to_vec()),
+        Distortion::Rational(d) => ("rational_polynomial", d.to_vec()),
+        Distortion::Equidistant(d) => ("equidistant", d.to_vec()),
+    };
+    CameraInfo {
+        header,
+        height: i.height_px,
+        width: i.width_px,
+        distortion_model: distortion_model.to_owned(),
+        d,
+        k: [i.fx, 0.0, cx, 0.0, i.fy, cy, 0.0, 0.0, 1.0],
+        r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p: [i.fx, 0.0, cx, 0.0, 0.0, i.fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        ..CameraInfo::default()
+    }
+}
