@@ -4,7 +4,8 @@ use splat_mapper::splat::Rendering;
 
 use crate::backends::BACKENDS;
 use crate::reference::hostile::{KINDS, camera};
-use crate::reference::random::Scene;
+use crate::reference::random::{self, Recipe, SMALL, Scene};
+use crate::reference::raster::Raster;
 use crate::reference::{Params, doubt, render};
 
 /// Half a step of an 8-bit picture: nobody sees less.
@@ -65,9 +66,9 @@ fn compare(scene: &Scene, rendering: &Rendering, max_error: f64) -> Result<Tally
     };
     for (pixel, doubt) in doubts.iter().enumerate() {
         let mut errors = [(0.0, 0.0); 5];
-        for channel in 0..3 {
+        for (channel, error) in errors[..3].iter_mut().enumerate() {
             let at = 3 * pixel + channel;
-            errors[channel] = (
+            *error = (
                 (f64::from(rendering.rgb[at]) - twin.rgb[at]).abs(),
                 doubt.rgb[channel],
             );
@@ -133,7 +134,10 @@ fn check(max_error: f64, mut backend: impl FnMut(&Scene) -> Rendering) -> Result
 
 /// The twin itself, rounded to f32: the best that a backend can be.
 fn rounded_twin(scene: &Scene) -> Rendering {
-    let raster = render(&Params::from(&scene.splats), &camera(scene), 3);
+    rounded(&render(&Params::from(&scene.splats), &camera(scene), 3))
+}
+
+fn rounded(raster: &Raster) -> Rendering {
     Rendering {
         width_px: raster.width_px as u32,
         height_px: raster.height_px as u32,
@@ -159,6 +163,97 @@ fn every_backends_pictures_are_the_twins() {
 fn few_pixels_hang_on_a_decision_that_rounding_may_turn() {
     check(1e-6, rounded_twin).unwrap();
     assert_eq!(KINDS.iter().map(|kind| kind.1).sum::<u64>(), 200);
+}
+
+/// Every parameter off by up to half a rounding of f32, equal ones by equal amounts, otherwise exact.
+fn shaken_twin(scene: &Scene) -> Rendering {
+    let mut params = Params::from(&scene.splats);
+    let means = params.means.as_flattened_mut().iter_mut();
+    let shapes = params
+        .log_scales
+        .as_flattened_mut()
+        .iter_mut()
+        .chain(params.quats.as_flattened_mut());
+    for value in means.chain(shapes).filter(|value| value.is_finite()) {
+        *value *= 1.0 + 6e-8 * (*value * 1e7).sin();
+    }
+    rounded(&render(&params, &camera(scene), 3))
+}
+
+#[test]
+fn rounding_of_the_parameters_stays_within_the_doubt() {
+    check(MAX_ERROR, shaken_twin).unwrap();
+}
+
+/// Two broad splats of different colours before the same pixels, at one depth up to rounding.
+fn rivals() -> Scene {
+    let mut scene = random::scene(
+        3,
+        &Recipe {
+            n_splats: 2,
+            opacity_logit: [0.5, 1.0],
+            size_px: [6.0, 8.0],
+            ..SMALL
+        },
+    );
+    for (ix, pixel) in [[7.0, 7.0], [11.0, 7.0]].into_iter().enumerate() {
+        let mean_in_cam = scene.view.intrinsics.ray_in_cam(pixel.into()) * 2.0;
+        let mean = scene
+            .view
+            .cam_from_map
+            .inverse()
+            .transform_point(mean_in_cam);
+        scene.splats.means[ix] = mean.as_vec3().to_array();
+    }
+    scene
+}
+
+#[test]
+fn splats_at_all_but_one_depth_are_in_doubt_by_what_their_swap_changes() {
+    let scene = rivals();
+    let camera = camera(&scene);
+    let nominal = Params::from(&scene.splats);
+    let with_second_nearer_by = |distance: f64| {
+        let mut params = nominal.clone();
+        for axis in 0..3 {
+            params.means[1][axis] -= distance * camera.rotation[(2, axis)];
+        }
+        render(&params, &camera, 3).rgb
+    };
+    let (nearer, farther) = (with_second_nearer_by(2e-6), with_second_nearer_by(-2e-6));
+    let doubts = doubt::doubt(&nominal, &camera, 3);
+    let mut largest = 0.0_f64;
+    for (at, (a, b)) in nearer.iter().zip(&farther).enumerate() {
+        largest = largest.max((a - b).abs());
+        assert!(
+            (a - b).abs() <= doubts[at / 3].rgb[at % 3] + 1e-4,
+            "{at}: {a} or {b}, {:?}",
+            doubts[at / 3]
+        );
+    }
+    assert!(largest > 0.05, "{largest}");
+}
+
+#[test]
+fn a_splat_at_the_threshold_is_in_doubt_by_all_it_shows() {
+    let mut scene = rivals();
+    // 1/255 up to a few roundings: its middle is drawn or not.
+    scene.splats.opacity_logits[1] = -(254.0_f32.ln());
+    let (params, camera) = (Params::from(&scene.splats), camera(&scene));
+    let mut without = params.clone();
+    without.opacity_logits[1] = -10.0;
+    let mut with = params.clone();
+    with.opacity_logits[1] += 1e-6;
+    with.log_scales[1] = [3.0; 3];
+    let mut at_threshold = with.clone();
+    at_threshold.opacity_logits[1] = params.opacity_logits[1];
+    let doubts = doubt::doubt(&at_threshold, &camera, 3);
+    let (with, without) = (render(&with, &camera, 3), render(&without, &camera, 3));
+    for (pixel, doubt) in doubts.iter().enumerate() {
+        let shown = (with.alpha[pixel] - without.alpha[pixel]).abs();
+        assert!(shown <= 1.01 * doubt.alpha, "{pixel}: {shown}, {doubt:?}");
+    }
+    assert!(doubts.iter().any(|doubt| doubt.alpha > 1e-3));
 }
 
 #[test]

@@ -123,7 +123,7 @@ fn at_near_plane(seed: u64) -> Scene {
     );
     // Some map units from the origin f32 would keep only three digits of such depths.
     let map_from_cam = scene.view.cam_from_map.inverse();
-    let turn = if seed % 2 == 0 {
+    let turn = if seed.is_multiple_of(2) {
         scene.view.cam_from_map.rotation
     } else {
         DQuat::IDENTITY
@@ -134,7 +134,7 @@ fn at_near_plane(seed: u64) -> Scene {
             .to_array();
     }
     scene.view.cam_from_map.translation = DVec3::ZERO;
-    if seed % 2 == 0 {
+    if seed.is_multiple_of(2) {
         // No rounding, so that all must agree on a splat exactly at the plane.
         scene.view.cam_from_map.rotation = DQuat::IDENTITY;
         scene.splats.means[0] = [0.0, 0.0, 0.01];
@@ -226,7 +226,14 @@ fn many_overlapping(seed: u64) -> Scene {
         size_px: [3.0, 20.0],
         ..PLAIN
     };
-    random::scene(seed, if seed % 2 == 0 { &faint } else { &dense })
+    random::scene(
+        seed,
+        if seed.is_multiple_of(2) {
+            &faint
+        } else {
+            &dense
+        },
+    )
 }
 
 /// All depths are equal as f32, so the index decides.
