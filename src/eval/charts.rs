@@ -65,8 +65,8 @@ pub fn curve_chart(curve: &Curve<'_>) -> Option<Markup> {
         y: Axis::new(if curve.from_zero { low.min(0.0) } else { low }, high, 5).widened(),
         left: 52.0,
         top: 12.0,
-        width: 560.0,
-        height: 240.0,
+        width: 450.0,
+        height: 230.0,
     };
     let line = polyline(points.iter().map(|&(x, y)| plot.at(x, y)));
     let (end_x, end_y) = plot.at(last.0, last.1);
@@ -88,9 +88,9 @@ pub fn curve_chart(curve: &Curve<'_>) -> Option<Markup> {
     );
     let label_y = (end_y - 8.0).max(plot.top + 10.0);
     Some(html! {
-        svg viewBox="0 0 640 296" role="img" aria-label=(label) {
+        svg viewBox="0 0 520 292" role="img" aria-label=(label) {
             (plot.grid())
-            text.axis x=(plot.left + plot.width / 2.0) y="292" text-anchor="middle" { "step" }
+            text.axis x=(plot.left + plot.width / 2.0) y="286" text-anchor="middle" { "step" }
             polyline.line.a points=(line) {}
             circle.dot.a cx=(px(end_x)) cy=(px(end_y)) r="3.5" {}
             text.value x=(px(end_x)) y=(px(label_y)) text-anchor="end" { (end) }
@@ -130,9 +130,9 @@ pub fn trajectory_chart(paths: &Paths<'_>, view: View) -> Option<Markup> {
     let forward = |timed: &TimedPose| flat(timed.pose.rotation * DVec3::Z) - flat(DVec3::ZERO);
     let dots = thinned(paths.keyframes, MAX_PATH_POINTS);
     Some(html! {
-        svg viewBox="0 0 640 452" role="img" aria-label=(format!("camera path {name}: {} keyframes", keyframes.len())) {
+        svg viewBox="0 0 520 432" role="img" aria-label=(format!("camera path {name}: {} keyframes", keyframes.len())) {
             (plot.grid())
-            text.axis x=(plot.left + plot.width / 2.0) y="448" text-anchor="middle" { (across) }
+            text.axis x=(plot.left + plot.width / 2.0) y="426" text-anchor="middle" { (across) }
             text.axis transform=(format!("translate(12 {}) rotate(-90)", plot.top + plot.height / 2.0)) text-anchor="middle" { (up) }
             @if reference.len() > 1 { polyline.line.b points=(path(&reference)) {} }
             @if frames.len() > 1 { polyline.line.thin points=(path(&frames)) {} }
@@ -251,7 +251,7 @@ struct Frame {
 impl Frame {
     /// Fits all points, one map unit as long on both axes.
     fn with_equal_scales(points: impl Iterator<Item = DVec2> + Clone) -> Option<Self> {
-        let (left, top, width, height) = (62.0, 10.0, 564.0, 384.0);
+        let (left, top, width, height) = (62.0, 10.0, 446.0, 370.0);
         points.clone().next()?;
         let min = points.clone().fold(DVec2::INFINITY, DVec2::min);
         let max = points.fold(DVec2::NEG_INFINITY, DVec2::max);
@@ -259,7 +259,7 @@ impl Frame {
         let smallest = 1e-3 * centre.abs().max_element().max(1e-6);
         let unit_per_px = (size.x / width).max(size.y / height).max(smallest / height);
         let half = DVec2::new(width, height) * unit_per_px / 2.0;
-        let x = Axis::new(centre.x - half.x, centre.x + half.x, 8);
+        let x = Axis::new(centre.x - half.x, centre.x + half.x, 7);
         let y = Axis::new(centre.y - half.y, centre.y + half.y, 6);
         Some(Self {
             x,

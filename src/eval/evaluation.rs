@@ -10,7 +10,9 @@ use serde::Serialize;
 use super::EvalError;
 use super::align::{AlignError, align};
 use super::report::{Quality, Report};
-use super::trajectory::{TOLERANCE_SECS, TimedPose, associate, read_tum};
+use super::trajectory::{
+    TOLERANCE_SECS, TimedPose, associate, read_tum, shifted, stamp_offset_nanos,
+};
 use crate::pose::Rigid;
 
 /// What `eval --json` prints. A figure that has no value is null and `note` says why.
@@ -68,6 +70,8 @@ pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalErro
 
 /// The figures for two trajectories in order of time.
 pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
+    let offset_nanos = stamp_offset_nanos(keyframes, reference, TOLERANCE_SECS);
+    let keyframes = &shifted(keyframes, offset_nanos)[..];
     let pairs = associate(keyframes, reference, TOLERANCE_SECS);
     let estimated: Vec<Rigid> = pairs.iter().map(|&(ix, _)| keyframes[ix].pose).collect();
     let truth: Vec<Rigid> = pairs.iter().map(|&(_, ix)| reference[ix].pose).collect();
@@ -81,7 +85,7 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         rpe_rotation_deg: None,
         aligned_scale: None,
         keyframes: keyframes.len(),
-        note: None,
+        note: shift_note(offset_nanos),
         quality: None,
     };
     let alignment = match align(&estimated, &truth) {
@@ -124,11 +128,21 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         rpe_translation: Some(rmse(motion_errors.iter().map(|error| error.translation.length()))),
         rpe_rotation_deg: Some(rmse(motion_errors.iter().map(|error| error.angle_to(&Rigid::IDENTITY).to_degrees()))),
         aligned_scale: Some(similarity.scale),
-        note: alignment.is_line.then(|| {
+        note: join_notes(shift_note(offset_nanos), alignment.is_line.then(|| {
             "the positions lie on a line: the roll about it was aligned by the orientations, so rotation_mean_deg leaves that part out".to_owned()
-        }),
+        })),
         ..empty
     }
+}
+
+fn shift_note(offset_nanos: i64) -> Option<String> {
+    let secs = offset_nanos / 1_000_000_000;
+    (secs != 0).then(|| format!("the stamps of the run were shifted by {secs} s to meet the reference"))
+}
+
+fn join_notes(first: Option<String>, second: Option<String>) -> Option<String> {
+    let notes: Vec<String> = first.into_iter().chain(second).collect();
+    (!notes.is_empty()).then(|| notes.join("; "))
 }
 
 /// The largest distance between two points. Exact up to some thousand points; beyond, at most 0.5 % too small.

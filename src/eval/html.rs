@@ -40,7 +40,7 @@ pub struct ReportInputs<'a> {
 
 pub fn write_html(inputs: &ReportInputs<'_>, path: &Path) -> Result<(), EvalError> {
     let page =
-        page(inputs).map_err(|e| EvalError::writing("the pictures of the report", e, path))?;
+        page(inputs).map_err(|e| EvalError::writing("the pictures of the report", &e, path))?;
     write_atomically("the report page", page.into_string().as_bytes(), path)
 }
 
@@ -116,7 +116,7 @@ fn tiles(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
         html! { div.card.tile { span.name { (name) } b { (value) } span.soft { (more) } } }
     };
     let held_out = format!(
-        "dB, SSIM {}; every {} keyframe held out",
+        "SSIM {}; every {} keyframe held out",
         figure(quality.ssim_holdout),
         ordinal(quality.holdout_every)
     );
@@ -128,9 +128,9 @@ fn tiles(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
     html! {
         section.tiles {
             @if quality.holdout_every > 0 {
-                (tile("PSNR of held-out views", decibels(quality.psnr_holdout), held_out))
+                (tile("Held-out PSNR", format!("{} dB", decibels(quality.psnr_holdout)), held_out))
             } @else {
-                (tile("PSNR of training views", decibels(quality.psnr_train), "dB; no view was held out".to_owned()))
+                (tile("Training PSNR", format!("{} dB", decibels(quality.psnr_train)), "no view was held out".to_owned()))
             }
             @if let Some(evaluation) = evaluation {
                 (tile("Trajectory error", format!("{} %", figure(evaluation.ate_percent_of_extent)),

@@ -54,12 +54,14 @@ fn channel_ssim(rendered: &[f32], photo: &RgbImage, channel: usize, window: &[f6
     let across: Vec<[f64; 5]> = (0..height)
         .into_par_iter()
         .flat_map_iter(|row| {
-            let pixel = move |col: usize| {
-                let ix = 3 * (row * width + col) + channel;
-                let (x, y) = (shown(rendered[ix]), f64::from(photo.pixels[ix]) / 255.0);
-                [x, y, x * x, y * y, x * y]
-            };
-            (0..n_cols).map(move |col| weighted(window, |tap| pixel(col + tap)))
+            let pixels: Vec<[f64; 5]> = (row * width..(row + 1) * width)
+                .map(|pixel_ix| {
+                    let ix = 3 * pixel_ix + channel;
+                    let (x, y) = (shown(rendered[ix]), f64::from(photo.pixels[ix]) / 255.0);
+                    [x, y, x * x, y * y, x * y]
+                })
+                .collect();
+            (0..n_cols).map(move |col| weighted(window, |tap| pixels[col + tap]))
         })
         .collect();
     let rows: Vec<f64> = (0..n_rows)
@@ -119,9 +121,7 @@ mod tests {
             .map(|ix| (0.7 * noise(ix, 0.618_034) + 0.5 * noise(ix / 40, 0.414_214) - 0.1) as f32)
             .collect();
         let pixels = (0..n)
-            .map(|ix| {
-                (255.0 * (0.6 * noise(ix, 0.618_034) + 0.4 * noise(ix / 40, 0.414_214))) as u8
-            })
+            .map(|ix| (255.0 * (0.35 * noise(ix, 0.618_034) + 0.65 * noise(ix, 0.732_051))) as u8)
             .collect();
         (
             rendered,

@@ -58,7 +58,7 @@ pub enum EvalError {
 }
 
 impl EvalError {
-    fn reading(what: &'static str, reason: impl ToString, path: &Path) -> Self {
+    fn reading(what: &'static str, reason: &impl ToString, path: &Path) -> Self {
         Self::File {
             action: "read",
             what,
@@ -67,7 +67,7 @@ impl EvalError {
         }
     }
 
-    fn writing(what: &'static str, reason: impl ToString, path: &Path) -> Self {
+    fn writing(what: &'static str, reason: &impl ToString, path: &Path) -> Self {
         Self::File {
             action: "write",
             what,
@@ -81,22 +81,22 @@ impl EvalError {
 fn read_text(what: &'static str, max_bytes: u64, path: &Path) -> Result<String, EvalError> {
     use std::io::Read;
 
-    let file = std::fs::File::open(path).map_err(|e| EvalError::reading(what, e, path))?;
+    let file = std::fs::File::open(path).map_err(|e| EvalError::reading(what, &e, path))?;
     let mut bytes = Vec::new();
     file.take(max_bytes + 1)
         .read_to_end(&mut bytes)
-        .map_err(|e| EvalError::reading(what, e, path))?;
+        .map_err(|e| EvalError::reading(what, &e, path))?;
     if bytes.len() as u64 > max_bytes {
         return Err(EvalError::reading(
             what,
-            format!("it holds more than {max_bytes} bytes"),
+            &format!("it holds more than {max_bytes} bytes"),
             path,
         ));
     }
     String::from_utf8(bytes).map_err(|e| {
         EvalError::reading(
             what,
-            format!(
+            &format!(
                 "it is no text, byte {} is not UTF-8",
                 e.utf8_error().valid_up_to()
             ),
@@ -118,6 +118,6 @@ pub fn write_atomically(what: &'static str, bytes: &[u8], path: &Path) -> Result
     written.map_err(|e| {
         // Nothing more can be done about the remains; the first error is the one to tell.
         std::fs::remove_file(&partial).ok();
-        EvalError::writing(what, e, path)
+        EvalError::writing(what, &e, path)
     })
 }

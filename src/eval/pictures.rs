@@ -182,3 +182,66 @@ fn viridis(value: f32) -> [u8; 3] {
     };
     [mix(0), mix(1), mix(2)]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_depth(depth: &[f32]) -> Rendering {
+        let n = depth.len();
+        let (width_px, height_px) = (n as u32, 1);
+        Rendering {
+            width_px,
+            height_px,
+            rgb: vec![0.5; 3 * n],
+            alpha: vec![1.0; n],
+            depth: depth.to_vec(),
+        }
+    }
+
+    #[test]
+    fn near_is_bright_far_is_dark_and_nothing_is_neither() {
+        let mut depth: Vec<f32> = (1..=200).map(|ix| ix as f32 / 10.0).collect();
+        depth.extend([0.0, f32::NAN, f32::INFINITY, -1.0]);
+        let picture = depth_in_colours(&with_depth(&depth)).unwrap();
+        let pixels = picture.image.pixels.as_chunks::<3>().0;
+        assert_eq!((pixels[0], pixels[199]), (VIRIDIS[9], VIRIDIS[0]));
+        assert!(pixels[200..].iter().all(|pixel| *pixel == NO_DEPTH));
+        assert!(
+            picture.near < 0.6 && picture.far > 19.0,
+            "{} {}",
+            picture.near,
+            picture.far
+        );
+    }
+
+    #[test]
+    fn a_view_of_nothing_has_no_depth_picture() {
+        assert!(depth_in_colours(&with_depth(&[0.0, f32::NAN])).is_none());
+        assert!(depth_in_colours(&with_depth(&[])).is_none());
+    }
+
+    #[test]
+    fn viridis_runs_from_dark_to_bright() {
+        let brightness = |value: f32| viridis(value).iter().map(|v| u32::from(*v)).sum::<u32>();
+        assert_eq!(
+            (viridis(-1.0), viridis(0.0), viridis(2.0)),
+            (VIRIDIS[0], VIRIDIS[0], VIRIDIS[9])
+        );
+        assert!(brightness(0.1) < brightness(0.5) && brightness(0.5) < brightness(0.9));
+    }
+
+    #[test]
+    fn shrinking_keeps_the_aspect_and_never_enlarges() {
+        let image = |width_px: u32, height_px: u32| RgbImage {
+            width_px,
+            height_px,
+            pixels: vec![7; (3 * width_px * height_px) as usize],
+        };
+        let size = |image: &RgbImage| (image.width_px, image.height_px);
+        assert_eq!(size(&shrunk(&image(1000, 500), 100)), (100, 50));
+        assert_eq!(size(&shrunk(&image(1000, 1), 100)), (100, 1));
+        assert_eq!(shrunk(&image(30, 20), 100), image(30, 20));
+        assert_eq!(shrunk(&image(0, 0), 100), image(0, 0));
+    }
+}

@@ -37,7 +37,7 @@ pub fn render_poses(
     let depth_out = out.join("depth");
     let folder = if depth { &depth_out } else { out };
     std::fs::create_dir_all(folder)
-        .map_err(|e| EvalError::writing("the folder of renders", e, folder))?;
+        .map_err(|e| EvalError::writing("the folder of renders", &e, folder))?;
     engine.append(splats);
     let mut list = "# timestamp filename\n".to_owned();
     for (ix, (stamp, map_from_cam)) in poses.iter().enumerate() {
@@ -62,7 +62,7 @@ pub fn render_poses(
 pub fn read_intrinsics(path: &Path) -> Result<Intrinsics, EvalError> {
     let text = read_text("the intrinsics", MAX_FILE_BYTES, path)?;
     let file: IntrinsicsFile =
-        serde_json::from_str(&text).map_err(|e| EvalError::reading("the intrinsics", e, path))?;
+        serde_json::from_str(&text).map_err(|e| EvalError::reading("the intrinsics", &e, path))?;
     let wrong = |problem: &'static str, found: String| EvalError::Intrinsics {
         problem,
         found,
@@ -79,7 +79,7 @@ pub fn read_intrinsics(path: &Path) -> Result<Intrinsics, EvalError> {
         ));
     }
     let side = |value: f64| {
-        (value >= 1.0 && value <= MAX_PIXELS && value.fract() == 0.0).then_some(value as u32)
+        ((1.0..=MAX_PIXELS).contains(&value) && value.fract() == 0.0).then_some(value as u32)
     };
     let (Some(width_px), Some(height_px)) = (side(file.width), side(file.height)) else {
         return Err(wrong(
@@ -127,11 +127,11 @@ struct IntrinsicsFile {
 }
 
 fn write_picture(rendering: &Rendering, path: &Path) -> Result<(), EvalError> {
-    let bytes = png(&rgb_of(rendering)).map_err(|e| EvalError::writing("a render", e, path))?;
+    let bytes = png(&rgb_of(rendering)).map_err(|e| EvalError::writing("a render", &e, path))?;
     write_atomically("a render", &bytes, path)
 }
 
 fn write_depth(rendering: &Rendering, path: &Path) -> Result<(), EvalError> {
-    let bytes = depth_png(rendering).map_err(|e| EvalError::writing("a depth render", e, path))?;
+    let bytes = depth_png(rendering).map_err(|e| EvalError::writing("a depth render", &e, path))?;
     write_atomically("a depth render", &bytes, path)
 }

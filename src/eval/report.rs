@@ -109,14 +109,14 @@ pub struct Scale {
 impl Report {
     pub fn write(&self, path: &Path) -> Result<(), EvalError> {
         let mut text = serde_json::to_string_pretty(self)
-            .map_err(|e| EvalError::writing("the report", e, path))?;
+            .map_err(|e| EvalError::writing("the report", &e, path))?;
         text.push('\n');
         write_atomically("the report", text.as_bytes(), path)
     }
 
     pub fn read(path: &Path) -> Result<Self, EvalError> {
         let text = read_text("the report", MAX_FILE_BYTES, path)?;
-        serde_json::from_str(&text).map_err(|e| EvalError::reading("the report", e, path))
+        serde_json::from_str(&text).map_err(|e| EvalError::reading("the report", &e, path))
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Knows nothing of what a pose is a pose of; alignment and figures are in `align` and `evaluation`.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use glam::{DQuat, DVec3};
@@ -125,6 +126,52 @@ pub fn associate(
         .collect()
 }
 
+/// Nanoseconds to add to the stamps of `estimate`, a whole number of seconds, so that most of them meet one of
+/// `reference`: recordings often start at an epoch of their own. 0 when some meet as they are, or nothing helps.
+pub fn stamp_offset_nanos(
+    estimate: &[TimedPose],
+    reference: &[TimedPose],
+    tolerance_secs: f64,
+) -> i64 {
+    const NANOS: i64 = 1_000_000_000;
+    const N_VOTERS: usize = 8;
+    let n_met = |offset| associate(&shifted(estimate, offset), reference, tolerance_secs).len();
+    if n_met(0) > 0 {
+        return 0;
+    }
+    let voters = estimate
+        .iter()
+        .step_by(estimate.len().div_ceil(N_VOTERS).max(1));
+    let gaps = voters.flat_map(|e| {
+        reference
+            .iter()
+            .map(|r| r.stamp.nanos.saturating_sub(e.stamp.nanos))
+    });
+    let whole_secs = gaps.filter_map(|gap| {
+        let whole = gap.saturating_add(NANOS / 2).div_euclid(NANOS) * NANOS;
+        ((gap - whole).abs() as f64 <= tolerance_secs * 1e9).then_some(whole)
+    });
+    let candidates: BTreeSet<i64> = whole_secs.collect();
+    // Even spacing lets several offsets meet equally many; an epoch is a rounder number than its neighbours.
+    let roundness = |offset: i64| {
+        let tens = std::iter::successors(Some(offset / NANOS), |v| (v % 10 == 0).then_some(v / 10));
+        tens.take(18).count()
+    };
+    candidates
+        .into_iter()
+        .max_by_key(|offset| (n_met(*offset), roundness(*offset)))
+        .unwrap_or(0)
+}
+
+/// The same poses at other times.
+pub fn shifted(poses: &[TimedPose], offset_nanos: i64) -> Vec<TimedPose> {
+    let shift = |timed: &TimedPose| TimedPose {
+        stamp: Stamp::from_nanos(timed.stamp.nanos.saturating_add(offset_nanos)),
+        ..*timed
+    };
+    poses.iter().map(shift).collect()
+}
+
 fn parse_line(content: &str) -> Result<TimedPose, &'static str> {
     let mut words = content.split_ascii_whitespace();
     let stamp =
@@ -134,7 +181,8 @@ fn parse_line(content: &str) -> Result<TimedPose, &'static str> {
         let word = words.next().ok_or("it has fewer than eight numbers")?;
         *number = word
             .parse()
-            .map_err(|_| "it holds something that is no number")?;
+            .ok()
+            .ok_or("it holds something that is no number")?;
     }
     if words.next().is_some() {
         return Err("it has more than eight numbers");
@@ -204,7 +252,7 @@ mod tests {
     #[test]
     fn stamps_are_read_to_the_nanosecond() {
         let check = |word: &str, nanos: Option<i64>| {
-            assert_eq!(parse_stamp(word).map(|s| s.nanos), nanos, "{word}")
+            assert_eq!(parse_stamp(word).map(|s| s.nanos), nanos, "{word}");
         };
         check("1403715273.262142976", Some(1_403_715_273_262_142_976));
         check("0.1", Some(100_000_000));

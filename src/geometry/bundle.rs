@@ -158,8 +158,20 @@ fn row(problem: &Problem, rotations: &[DMat3], point: DVec3, seen: &Observation,
     let (x, y, iz) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
     let (fx, fy) = (w * camera.intrinsics.fx, w * camera.intrinsics.fy);
     let by_camera = SMatrix::<f64, 2, PARAMS>::from_row_slice(&[
-        fx * iz, 0.0, -fx * x * iz, -fx * x * y, fx * (1.0 + x * x), -fx * y, fx * x,
-        0.0, fy * iz, -fy * y * iz, -fy * (1.0 + y * y), fy * x * y, fy * x, fy * y,
+        fx * iz,
+        0.0,
+        -fx * x * iz,
+        -fx * x * y,
+        fx * (1.0 + x * x),
+        -fx * y,
+        fx * x,
+        0.0,
+        fy * iz,
+        -fy * y * iz,
+        -fy * (1.0 + y * y),
+        fy * x * y,
+        fy * x,
+        fy * y,
     ]);
     let turn = rotations[seen.camera_ix].transpose();
     let (du, dv) = (turn * DVec3::new(fx * iz, 0.0, -fx * x * iz), turn * DVec3::new(0.0, fy * iz, -fy * y * iz));
@@ -205,7 +217,13 @@ fn damped(v: &Matrix3<f64>, damping: f64) -> Option<Matrix3<f64>> {
 }
 
 /// Adds one point's share to the lower triangle of the reduced system.
-fn eliminate(problem: &Problem, layout: &Layout, block: &PointBlock, damping: f64, (s, b): (&mut DMatrix<f64>, &mut DVector<f64>)) {
+fn eliminate(
+    problem: &Problem,
+    layout: &Layout,
+    block: &PointBlock,
+    damping: f64,
+    (s, b): (&mut DMatrix<f64>, &mut DVector<f64>),
+) {
     let Some(inverse) = damped(&block.v, damping) else { return };
     let cross: Vec<SMatrix<f64, PARAMS, 3>> = block.rows.iter().map(|r| r.by_camera.transpose() * r.by_point).collect();
     let columns: Vec<[Option<usize>; PARAMS]> = block
@@ -238,7 +256,12 @@ fn eliminate(problem: &Problem, layout: &Layout, block: &PointBlock, damping: f6
     }
 }
 
-fn add(s: &mut DMatrix<f64>, rows: &[Option<usize>; PARAMS], columns: &[Option<usize>; PARAMS], values: &SMatrix<f64, PARAMS, PARAMS>) {
+fn add(
+    s: &mut DMatrix<f64>,
+    rows: &[Option<usize>; PARAMS],
+    columns: &[Option<usize>; PARAMS],
+    values: &SMatrix<f64, PARAMS, PARAMS>,
+) {
     for (c, column) in columns.iter().enumerate() {
         let Some(column) = column else { continue };
         for (r, row) in rows.iter().enumerate() {
@@ -254,7 +277,10 @@ fn apply(problem: &Problem, layout: &Layout, normal: &Normal, delta: &DVector<f6
     let focal_step = layout.focal.map_or(0.0, |i| delta[i].clamp(-0.3, 0.3));
     for (camera, offset) in out.cameras.iter_mut().zip(&layout.offset) {
         if let Some(at) = *offset {
-            let (rho, theta) = (DVec3::new(delta[at], delta[at + 1], delta[at + 2]), DVec3::new(delta[at + 3], delta[at + 4], delta[at + 5]));
+            let (rho, theta) = (
+                DVec3::new(delta[at], delta[at + 1], delta[at + 2]),
+                DVec3::new(delta[at + 3], delta[at + 4], delta[at + 5]),
+            );
             camera.cam_from_map = (Rigid::exp(rho, theta) * camera.cam_from_map).renormalized();
         }
         if camera.shares_focal {
@@ -294,3 +320,6 @@ fn total_cost(problem: &Problem, loss_px: f64) -> f64 {
     let costs: Vec<f64> = problem.points.par_iter().zip(&problem.observations).map(cost).collect();
     costs.iter().sum()
 }
+
+#[cfg(test)]
+mod tests;

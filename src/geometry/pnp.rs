@@ -20,7 +20,13 @@ pub struct Placement {
 const MAX_TRIES: usize = 2000;
 
 /// `None` when fewer than `min_inliers` pairs agree within `max_error_px`.
-pub fn place(points: &[DVec3], pixels: &[DVec2], camera: &Intrinsics, limits: (f64, usize), seed: u64) -> Option<Placement> {
+pub fn place(
+    points: &[DVec3],
+    pixels: &[DVec2],
+    camera: &Intrinsics,
+    limits: (f64, usize),
+    seed: u64,
+) -> Option<Placement> {
     let (max_error_px, min_inliers) = limits;
     let n = points.len();
     if n < min_inliers.max(4) || n != pixels.len() {
@@ -80,7 +86,8 @@ pub fn refine(pairs: &[(DVec3, DVec2)], camera: &Intrinsics, start: &Rigid, scal
         }
         let damped = hessian + Matrix6::identity() * (1e-9 * hessian.trace());
         let Some(step) = damped.cholesky().map(|c| -c.solve(&gradient)) else { break };
-        pose = (Rigid::exp(DVec3::new(step[0], step[1], step[2]), DVec3::new(step[3], step[4], step[5])) * pose).renormalized();
+        pose = (Rigid::exp(DVec3::new(step[0], step[1], step[2]), DVec3::new(step[3], step[4], step[5])) * pose)
+            .renormalized();
         if step.norm() < 1e-10 {
             break;
         }
@@ -169,7 +176,11 @@ fn positive_roots(c: &[f64; 5]) -> Vec<f64> {
             }
             for _ in 0..60 {
                 let middle = 0.5 * (low + high);
-                if (value(middle) < 0.0) == rising { low = middle } else { high = middle }
+                if (value(middle) < 0.0) == rising {
+                    low = middle;
+                } else {
+                    high = middle;
+                }
                 if high - low <= 1e-13 * high {
                     break;
                 }

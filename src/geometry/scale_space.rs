@@ -91,13 +91,9 @@ impl Grey {
         across.par_chunks_mut(w).zip(self.pixels.par_chunks(w)).for_each(|(out, row)| blur_row(row, &kernel, out));
         let mut pixels = vec![0.0_f32; w * h];
         pixels.par_chunks_mut(w).enumerate().for_each(|(y, out)| {
-            for (k, &weight) in kernel.iter().enumerate() {
-                let source = mirrored(y as isize + k as isize - radius as isize, h);
-                let row = &across[source * w..(source + 1) * w];
-                for (o, &v) in out.iter_mut().zip(row) {
-                    *o += weight * v;
-                }
-            }
+            let row_of = |k: usize| mirrored(y as isize + k as isize - radius as isize, h) * w;
+            let rows: Vec<&[f32]> = (0..kernel.len()).map(|k| &across[row_of(k)..row_of(k) + w]).collect();
+            weighted_sum(&rows, &kernel, out);
         });
         Self { width: w, height: h, pixels }
     }
@@ -143,7 +139,10 @@ fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
         .par_iter()
         .map(|&(layer, y)| {
             let candidates = (BORDER..w - BORDER).filter(|&x| is_extremum(&differences, layer, x, y));
-            candidates.filter_map(|x| refined(&differences, layer, x, y)).map(|b| Blob { octave: octave_ix, ..b }).collect()
+            candidates
+                .filter_map(|x| refined(&differences, layer, x, y))
+                .map(|b| Blob { octave: octave_ix, ..b })
+                .collect()
         })
         .collect();
     found.into_iter().flatten().collect()
@@ -162,17 +161,40 @@ fn gaussian(sigma: f32) -> Vec<f32> {
 
 fn mirrored(i: isize, n: usize) -> usize {
     let n = n as isize;
-    let folded = if i < 0 { -i } else if i >= n { 2 * n - 2 - i } else { i };
+    let folded = if i < 0 {
+        -i
+    } else if i >= n {
+        2 * n - 2 - i
+    } else {
+        i
+    };
     folded.clamp(0, n - 1) as usize
 }
 
 fn blur_row(row: &[f32], kernel: &[f32], out: &mut [f32]) {
     let (w, radius) = (row.len(), kernel.len() / 2);
     let padded: Vec<f32> = (0..w + 2 * radius).map(|i| row[mirrored(i as isize - radius as isize, w)]).collect();
-    for (k, &weight) in kernel.iter().enumerate() {
-        for (o, &v) in out.iter_mut().zip(&padded[k..k + w]) {
-            *o += weight * v;
+    let shifted: Vec<&[f32]> = (0..kernel.len()).map(|k| &padded[k..k + w]).collect();
+    weighted_sum(&shifted, kernel, out);
+}
+
+/// Most of the time of finding features goes here.
+#[multiversion::multiversion(targets("x86_64+avx2", "aarch64+neon"))]
+fn weighted_sum(rows: &[&[f32]], weights: &[f32], out: &mut [f32]) {
+    // A short stretch of the output stays in registers while all rows are added to it.
+    const STRETCH: usize = 32;
+    let n = out.len();
+    for start in (0..n - n % STRETCH).step_by(STRETCH) {
+        let mut sum = [0.0_f32; STRETCH];
+        for (row, &weight) in rows.iter().zip(weights) {
+            for (s, &v) in sum.iter_mut().zip(&row[start..start + STRETCH]) {
+                *s += weight * v;
+            }
         }
+        out[start..start + STRETCH].copy_from_slice(&sum);
+    }
+    for i in n - n % STRETCH..n {
+        out[i] = rows.iter().zip(weights).map(|(row, weight)| weight * row[i]).sum();
     }
 }
 

@@ -172,40 +172,32 @@ fn read_small(path: &Path, max_bytes: u64) -> Result<Vec<u8>, String> {
 fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a, b);
     loop {
-        let (text_a, text_b) = (
-            head(a, |c| !c.is_ascii_digit()),
-            head(b, |c| !c.is_ascii_digit()),
-        );
-        let by_text = text_a.cmp(text_b);
-        if by_text != Ordering::Equal {
-            return by_text;
-        }
-        (a, b) = (&a[text_a.len()..], &b[text_b.len()..]);
-        let (digits_a, digits_b) = (
-            head(a, |c| c.is_ascii_digit()),
-            head(b, |c| c.is_ascii_digit()),
-        );
-        let (number_a, number_b) = (
-            digits_a.trim_start_matches('0'),
-            digits_b.trim_start_matches('0'),
-        );
-        let by_number = number_a
-            .len()
-            .cmp(&number_b.len())
-            .then_with(|| number_a.cmp(number_b));
-        if by_number != Ordering::Equal {
-            return by_number;
-        }
-        (a, b) = (&a[digits_a.len()..], &b[digits_b.len()..]);
-        if a.is_empty() && b.is_empty() {
-            return Ordering::Equal;
-        }
+        let (digits_a, digits_b) = (leading_digits(a), leading_digits(b));
+        let (char_a, char_b) = (a.chars().next(), b.chars().next());
+        let order = if digits_a.is_empty() || digits_b.is_empty() {
+            char_a.cmp(&char_b)
+        } else {
+            let (number_a, number_b) = (
+                digits_a.trim_start_matches('0'),
+                digits_b.trim_start_matches('0'),
+            );
+            number_a
+                .len()
+                .cmp(&number_b.len())
+                .then_with(|| number_a.cmp(number_b))
+        };
+        let (Ordering::Equal, Some(char_a), Some(char_b)) = (order, char_a, char_b) else {
+            return order;
+        };
+        a = &a[digits_a.len().max(char_a.len_utf8())..];
+        b = &b[digits_b.len().max(char_b.len_utf8())..];
     }
 }
 
-/// The longest beginning whose characters all fit.
-fn head(text: &str, fits: impl Fn(char) -> bool) -> &str {
-    &text[..text.find(|c| !fits(c)).unwrap_or(text.len())]
+fn leading_digits(text: &str) -> &str {
+    &text[..text
+        .find(|c: char| !c.is_ascii_digit())
+        .unwrap_or(text.len())]
 }
 
 #[cfg(test)]

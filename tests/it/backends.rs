@@ -10,8 +10,6 @@ use crate::reference::loss::MIN_DEPTH_ALPHA;
 use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::{self, Params, Target, Weights};
 
-/// f32 through seven stages: the norm of the error of each parameter array over the array's norm.
-const MAX_RELATIVE: f64 = 1e-3;
 const ARRAYS: [&str; 6] = [
     "means",
     "log_scales",
@@ -24,12 +22,18 @@ const ARRAYS: [&str; 6] = [
 /// What stands in the dock.
 pub struct Backend {
     pub name: &'static str,
+    /// What it reaches, with room for a few roundings; far below the bars for any backend.
+    pub picture_error: f64,
+    /// Norm of the error of a parameter array over the array's norm.
+    pub gradient_error: f64,
     pub engine: fn() -> Box<dyn Engine>,
     pub gradients: fn(&Splats, &TrainingView, &StepSettings) -> Gradients,
 }
 
 pub const BACKENDS: [Backend; 1] = [Backend {
     name: "cpu",
+    picture_error: 1e-4,
+    gradient_error: 2e-4,
     engine: || Box::new(CpuEngine::new()),
     gradients: cpu::gradients,
 }];
@@ -222,7 +226,7 @@ fn every_backends_gradients_are_the_twins() {
                     .unwrap_or_else(|reason| panic!("{name}, seed {seed}: {reason}"));
                 for (which, error) in errors.into_iter().enumerate() {
                     assert!(
-                        error <= MAX_RELATIVE,
+                        error <= backend.gradient_error,
                         "{}, {name}, seed {seed}, {which}: {errors:?}",
                         backend.name
                     );

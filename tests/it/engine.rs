@@ -8,7 +8,7 @@ use rand_pcg::Pcg32;
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::frame::{DepthMap, RgbImage};
 use splat_mapper::pose::Rigid;
-use splat_mapper::splat::cpu::{CpuEngine, gradients};
+use splat_mapper::splat::cpu::CpuEngine;
 use splat_mapper::splat::{Engine, Rendering, Splats, StepSettings, TrainingView};
 
 const WIDTH_PX: u32 = 61;
@@ -226,84 +226,6 @@ fn a_view_that_sees_nothing_changes_nothing() {
     engine.step(0, &settings());
     assert!(engine.splats() == splats);
     assert_eq!(engine.poses()[0], away);
-}
-
-/// A splat ends where alpha is 1/255, not 0: moving that edge changes the loss, and differences see it while the
-/// gradient does not. So only most of a difference can agree, the most for parameters that move no edge.
-const ALIKE: [(&str, f64); 5] = [
-    ("means", 0.995),
-    ("log_scales", 0.98),
-    ("quats", 0.99),
-    ("opacity_logits", 0.99),
-    ("sh", 0.9999),
-];
-
-#[test]
-fn gradients_agree_with_differences_of_the_loss() {
-    let splats = random_splats(30, 12);
-    let view = photograph(&disturbed(&splats), &side_pose());
-    let g = gradients(&splats, &view, &settings());
-    assert!(g.visible.len() > 20 && g.depth > 0.0);
-    let loss = |change: &dyn Fn(&mut Splats)| {
-        let mut splats = splats.clone();
-        change(&mut splats);
-        gradients(&splats, &view, &settings()).loss
-    };
-    let check =
-        |kind: usize, found: &[f32], step: f32, change: &dyn Fn(&mut Splats, usize, f32)| {
-            let expected = (0..found.len()).map(|k| {
-                let difference = loss(&|s| change(s, k, step)) - loss(&|s| change(s, k, -step));
-                difference / (2.0 * f64::from(step))
-            });
-            assert_alike(
-                ALIKE[kind],
-                &found.iter().map(|&g| f64::from(g)).collect::<Vec<_>>(),
-                &expected.collect::<Vec<_>>(),
-            );
-        };
-    check(0, g.means.as_flattened(), 2e-4, &|s, k, d| {
-        s.means.as_flattened_mut()[k] += d
-    });
-    check(1, g.log_scales.as_flattened(), 2e-3, &|s, k, d| {
-        s.log_scales.as_flattened_mut()[k] += d
-    });
-    check(2, g.quats.as_flattened(), 2e-3, &|s, k, d| {
-        s.quats.as_flattened_mut()[k] += d
-    });
-    check(3, &g.opacity_logits, 5e-3, &|s, k, d| {
-        s.opacity_logits[k] += d
-    });
-    check(4, &g.sh[..480], 5e-3, &|s, k, d| s.sh[k] += d);
-    let expected: [f64; 6] = std::array::from_fn(|axis| {
-        let mut delta = [0.0; 6];
-        delta[axis] = 1e-4;
-        let moved = |sign: f64| {
-            let d = delta.map(|d| sign * d);
-            let step = Rigid::exp(DVec3::new(d[0], d[1], d[2]), DVec3::new(d[3], d[4], d[5]));
-            let view = TrainingView {
-                cam_from_map: step * view.cam_from_map,
-                ..view.clone()
-            };
-            gradients(&splats, &view, &settings()).loss
-        };
-        (moved(1.0) - moved(-1.0)) / 2e-4
-    });
-    assert_alike(("pose", 0.999), &g.pose, &expected);
-}
-
-/// Cosine above the bound, and lengths within 5 %.
-fn assert_alike((name, min_cosine): (&str, f64), found: &[f64], expected: &[f64]) {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let (ff, fe, ee) = (
-        dot(found, found),
-        dot(found, expected),
-        dot(expected, expected),
-    );
-    let (cosine, ratio) = (fe / (ff * ee).sqrt(), (ff / ee).sqrt());
-    assert!(
-        cosine > min_cosine && (ratio - 1.0).abs() < 0.05,
-        "{name}: cosine {cosine}, ratio {ratio}"
-    );
 }
 
 fn trained(n_steps: usize) -> (Splats, Vec<Rigid>, [u64; 2]) {

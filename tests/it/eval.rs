@@ -239,6 +239,68 @@ fn known_perturbations_give_known_errors() {
     assert!((figures.rpe_translation.unwrap() - step.length()).abs() < EXACT);
 }
 
+/// The same perturbation, alignment (SVD) and figures written in numpy, to twelve digits.
+#[test]
+fn real_trajectories_get_the_figures_of_an_independent_program() {
+    let expected = [
+        (
+            "fox",
+            [
+                0.0604653162048,
+                0.847058138248,
+                0.365449890841,
+                0.0972926565337,
+                0.48796111716,
+                0.500061624013,
+            ],
+        ),
+        (
+            "kitti_vo1",
+            [
+                0.0603717971092,
+                0.100857596089,
+                0.38278749095,
+                0.0966419602456,
+                0.486114239389,
+                0.500012429961,
+            ],
+        ),
+    ];
+    for (name, expected) in expected {
+        let Some(folder) = scene(name) else { return };
+        let reference = read_tum(&folder.join("poses_tum.txt")).unwrap();
+        let world = DQuat::from_rotation_x(0.5);
+        let run: Vec<TimedPose> = (reference.iter().enumerate())
+            .map(|(ix, timed)| {
+                let i = ix as f64;
+                let off = 0.05 * DVec3::new(i.sin(), (2.0 * i).cos(), (3.0 * i).sin());
+                let rotation =
+                    world * timed.pose.rotation * DQuat::from_rotation_z(0.01 * (5.0 * i).sin());
+                TimedPose {
+                    pose: Rigid::new(rotation, 2.0 * (world * (timed.pose.translation + off))),
+                    ..*timed
+                }
+            })
+            .collect();
+        let figures = compare(&run, &reference);
+        let found = [
+            figures.ate_rmse,
+            figures.ate_percent_of_extent,
+            figures.rotation_mean_deg,
+            figures.rpe_translation,
+            figures.rpe_rotation_deg,
+            figures.aligned_scale,
+        ];
+        for (found, expected) in found.iter().zip(expected) {
+            assert!(
+                (found.unwrap() / expected - 1.0).abs() < EXACT,
+                "{name}: {figures:?} {expected}"
+            );
+        }
+        assert_eq!(figures.note, None, "{name}");
+    }
+}
+
 #[test]
 fn the_extent_is_that_of_the_whole_reference() {
     let mut rng = Pcg64Mcg::seed_from_u64(7);

@@ -2,7 +2,6 @@
 #![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
-#[cfg(feature = "zenoh")]
 
 mod backends;
 mod bags;
@@ -17,6 +16,7 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
+#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;

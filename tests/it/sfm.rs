@@ -54,7 +54,7 @@ pub(crate) fn keyframe(
         truth: None,
         truth_depth: None,
     };
-    Arc::new(Keyframe { id, frame })
+    Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
 }
 
 pub(crate) fn intrinsics(folder: &Path) -> Intrinsics {
@@ -122,11 +122,8 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let secs = watch.secs();
     let components: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
     let largest = components.iter().max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
-    let pairs: Vec<(Rigid, Rigid)> = poses
-        .iter()
-        .filter(|(_, p)| Some(&p.0) == largest)
-        .map(|(id, p)| (shown.truth[*id as usize], p.1))
-        .collect();
+    let pairs: Vec<(Rigid, Rigid)> =
+        poses.iter().filter(|(_, p)| Some(&p.0) == largest).map(|(id, p)| (shown.truth[*id as usize], p.1)).collect();
     let (ate_percent, rotation_deg) = errors(&pairs);
     Figures {
         registered: pairs.len(),

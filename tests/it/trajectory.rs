@@ -3,6 +3,8 @@
 use std::path::Path;
 
 use glam::{DQuat, DVec3};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
 use splat_mapper::clock::Stamp;
 use splat_mapper::eval::trajectory::{TOLERANCE_SECS, TimedPose, associate, format_tum, parse_tum};
 use splat_mapper::pose::Rigid;
@@ -107,4 +109,31 @@ fn order_comments_and_repeated_lines_do_not_matter() {
     assert_eq!(stamps, [1.5, 2.0]);
     assert_eq!(poses[0].pose.rotation, DQuat::IDENTITY);
     assert_eq!(parse_tum("", Path::new("x")).unwrap(), []);
+}
+
+#[test]
+fn damaged_files_end_in_poses_or_an_error_never_a_panic() {
+    let mut rng = Pcg64Mcg::seed_from_u64(1);
+    let good = "# head\n0.1 1 2 3 0 0 0 1\n1.5e0 -1.25 2e-3 3 0.5 0.5 0.5 0.5\n3 4 5 6 0 0 0 -1\n";
+    let (mut n_read, mut n_refused) = (0, 0);
+    for _ in 0..4000 {
+        let mut bytes = good.as_bytes().to_vec();
+        for _ in 0..rng.random_range(1..4) {
+            let at = rng.random_range(0..bytes.len());
+            match rng.random_range(0..3) {
+                0 => bytes[at] = b"0123456789.-+eEnainf# \n\t\0\xc3\xa9"[rng.random_range(0..27)],
+                1 => bytes.truncate(at + 1),
+                _ => bytes.insert(at, bytes[at]),
+            }
+        }
+        match parse_tum(&String::from_utf8_lossy(&bytes), Path::new("x")) {
+            Ok(poses) => {
+                n_read += 1;
+                assert!(poses.iter().all(|timed| timed.pose.is_finite()));
+                assert!(poses.is_sorted_by(|a, b| a.stamp < b.stamp));
+            }
+            Err(_) => n_refused += 1,
+        }
+    }
+    assert!(n_read > 100 && n_refused > 100, "{n_read} {n_refused}");
 }

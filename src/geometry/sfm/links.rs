@@ -69,7 +69,13 @@ fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, 
     let focal_known = !scene.components.is_empty();
     let compare = |&other: &usize| {
         let raw = matches(&Wide::new(&scene.shots[other].features.descriptors), &wide);
-        let link = verified(&scene.shots[other], &scene.shots[shot_ix], &raw, focal_known, (max_error_px, pair_seed(seed, other, shot_ix)));
+        let link = verified(
+            &scene.shots[other],
+            &scene.shots[shot_ix],
+            &raw,
+            focal_known,
+            (max_error_px, pair_seed(seed, other, shot_ix)),
+        );
         link.map(|link| (other, link))
     };
     let found: Vec<(usize, Link)> = others.par_iter().filter_map(compare).collect();
@@ -98,7 +104,13 @@ pub(super) fn pixel_pairs(a: &Shot, b: &Shot, matches: &[(u32, u32)]) -> Vec<(DV
     matches.iter().map(|&(i, j)| (a.features.pixels[i as usize], b.features.pixels[j as usize])).collect()
 }
 
-fn verified(a: &Shot, b: &Shot, raw: &[(u32, u32)], focal_known: bool, (max_error_px, seed): (f64, u64)) -> Option<Link> {
+fn verified(
+    a: &Shot,
+    b: &Shot,
+    raw: &[(u32, u32)],
+    focal_known: bool,
+    (max_error_px, seed): (f64, u64),
+) -> Option<Link> {
     if raw.len() < MIN_LINK {
         return None;
     }

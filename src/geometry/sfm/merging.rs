@@ -36,7 +36,8 @@ fn merge_pair(scene: &mut Scene, stays: u32, gone: u32, limits: &Limits) -> bool
     if pairs.len() < limits.min_inliers {
         return false;
     }
-    let Some((stays_from_gone, inliers)) = similarity(scene, &pairs, limits, pair_seed(limits.seed, stays as usize, gone as usize))
+    let Some((stays_from_gone, inliers)) =
+        similarity(scene, &pairs, limits, pair_seed(limits.seed, stays as usize, gone as usize))
     else {
         return false;
     };
@@ -77,7 +78,8 @@ fn common_landmarks(scene: &Scene, a: u32, b: u32) -> Vec<(u32, u32)> {
     let mut ranked: Vec<((u32, u32), usize)> = votes.into_iter().collect();
     ranked.sort_by(|x, y| y.1.cmp(&x.1).then(x.0.cmp(&y.0)));
     let (mut taken_a, mut taken_b) = (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
-    ranked.retain(|((l, m), _)| !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m));
+    ranked
+        .retain(|((l, m), _)| !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m));
     ranked.into_iter().map(|r| r.0).collect()
 }
 

@@ -4,8 +4,8 @@
 //! that no placed one shares enough with may start a component of their own, which is merged when a link turns up.
 
 mod adjusting;
-mod densify;
 mod calibrating;
+mod densify;
 mod landmarks;
 mod links;
 mod merging;
@@ -13,14 +13,18 @@ mod placing;
 mod report;
 mod scene;
 mod starting;
+#[cfg(test)]
+mod tests;
 
 use std::sync::Arc;
+
+use rayon::prelude::*;
 
 pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 
 use self::adjusting::adjust_global;
-use self::densify::Densifier;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
+use self::densify::Densifier;
 use self::links::{link_alike, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
@@ -30,13 +34,15 @@ use self::starting::{Start, start};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, SfmParams};
 use crate::frame::{Batch, Keyframe};
-use crate::geometry::features::{features, working_picture, working_size};
+use crate::geometry::features::{Features, features, working_picture, working_size};
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
 /// Keyframes that a component beside the first one needs; less is likelier a mistake than a place.
 const MIN_NEW_COMPONENT: usize = 4;
+/// Waiting keyframes that are tried with every batch, the newest; all others once more at the end.
+const MAX_WAITING: usize = 64;
 /// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
 const FIRST_FOCAL: f64 = 0.9;
 
@@ -78,13 +84,19 @@ impl Sfm {
     pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
         let limits = self.limits(&batch.keyframes);
-        for keyframe in &batch.keyframes {
-            if self.shot_of(keyframe.id).is_none() {
-                self.add(keyframe);
-                link_newest(&mut self.scene, limits.max_error_px, self.seed);
-            }
+        let fresh: Vec<&Arc<Keyframe>> = batch.keyframes.iter().filter(|k| self.shot_of(k.id).is_none()).collect();
+        let looked = |keyframe: &&Arc<Keyframe>| {
+            let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
+            (features(&picture, self.sfm.max_features), (picture.width as u32, picture.height as u32))
+        };
+        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
+        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
+            self.push(keyframe, features, size);
+            link_newest(&mut self.scene, limits.max_error_px, self.seed);
         }
-        self.place_waiting(&limits, MIN_NEW_COMPONENT);
+        let waiting = self.waiting();
+        let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
+        self.place_waiting(newest, &limits, MIN_NEW_COMPONENT);
         self.adjust_grown(&limits);
         let shared: Vec<usize> =
             batch.keyframes.iter().take(batch.n_shared).filter_map(|k| self.shot_of(k.id)).collect();
@@ -95,12 +107,12 @@ impl Sfm {
     pub fn finish_sparse(&mut self) -> SparseBatch {
         let keyframes: Vec<Arc<Keyframe>> = self.scene.shots.iter().map(|s| Arc::clone(&s.keyframe)).collect();
         let limits = self.limits(&keyframes);
-        let waiting: Vec<usize> = (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect();
+        let waiting = self.waiting();
         for &shot in &waiting {
             self.scene.shots[shot].failed_with = 0;
             link_alike(&mut self.scene, shot, limits.max_error_px, self.seed);
         }
-        self.place_waiting(&limits, 3);
+        self.place_waiting(&waiting, &limits, 3);
         for component in 0..self.scene.components.len() as u32 {
             adjust_global(&mut self.scene, component, limits.max_error_px, 30);
         }
@@ -133,11 +145,9 @@ impl Sfm {
         self.scene.shots.iter().rposition(|s| s.keyframe.id == keyframe_id)
     }
 
-    fn add(&mut self, keyframe: &Arc<Keyframe>) {
+    /// Adds a shot whose features are given in a working picture of that size.
+    fn push(&mut self, keyframe: &Arc<Keyframe>, found: Features, (w, h): (u32, u32)) {
         let image = &keyframe.frame.image;
-        let picture = working_picture(image, self.sfm.max_side);
-        let found = features(&picture, self.sfm.max_features);
-        let (w, h) = (picture.width as u32, picture.height as u32);
         let known = keyframe.frame.intrinsics.filter(Intrinsics::is_plausible);
         let lens = known.unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px)).resized(w, h);
         self.scene.shots.push(Shot {
@@ -181,17 +191,20 @@ impl Sfm {
         Some(start_uncalibrated(&mut self.scene, pool, guess, limits))
     }
 
-    fn place_waiting(&mut self, limits: &Limits, min_shots: usize) {
-        let pool: Vec<usize> = (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect();
-        grow(&mut self.scene, &pool, limits);
-        while let Some(outcome) = self.try_start(&pool, min_shots, limits) {
+    fn waiting(&self) -> Vec<usize> {
+        (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect()
+    }
+
+    fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_shots: usize) {
+        grow(&mut self.scene, pool, limits);
+        while let Some(outcome) = self.try_start(pool, min_shots, limits) {
             self.last_start = Some(outcome);
             if outcome != Start::Started {
                 break;
             }
         }
         while merge(&mut self.scene, limits) {
-            grow(&mut self.scene, &pool, limits);
+            grow(&mut self.scene, pool, limits);
         }
     }
 
@@ -206,12 +219,8 @@ impl Sfm {
     }
 
     fn densify(&mut self, sparse: SparseBatch) -> GeometryBatch {
-        let shots = &self.scene.shots;
-        let image_of = |id: u32| {
-            let shot = shots.iter().rev().find(|shot| shot.keyframe.id == id)?;
-            Some(Arc::clone(&shot.keyframe.frame.image))
-        };
-        self.densifier.densify(sparse, &image_of)
+        let scene = &self.scene;
+        self.densifier.densify(sparse, &|id| scene.image_of(id))
     }
 }
 

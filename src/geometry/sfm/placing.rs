@@ -27,6 +27,13 @@ pub(super) fn grow(scene: &mut Scene, pool: &[usize], limits: &Limits) {
         scene.place(shot, component, cam_from_map);
         extend(scene, shot, limits.max_error_px);
         adjust_local(scene, shot, limits.max_error_px);
+        // Landmarks that the adjustment threw out again spoke for a wrong pose.
+        let n_left = scene.shots[shot].landmark_of.iter().filter(|l| **l != NONE).count();
+        if 3 * n_left < 2 * limits.min_inliers {
+            scene.unplace(shot);
+            scene.shots[shot].failed_with = pairs.len();
+            continue;
+        }
         let size = &scene.components[component as usize];
         if size.shots.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 {
             adjust_global(scene, component, limits.max_error_px, 8);

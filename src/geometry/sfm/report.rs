@@ -101,7 +101,8 @@ pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
     }
     let n_components = scene.components.iter().filter(|c| !c.shots.is_empty()).count();
     if waiting.is_empty() {
-        return (n_components > 1).then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
+        return (n_components > 1)
+            .then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
     }
     let shown: Vec<String> = waiting.iter().take(10).map(u32::to_string).collect();
     let more = if waiting.len() > 10 { ", ..." } else { "" };
@@ -117,10 +118,6 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     let shot = &scene.shots[shot_ix];
     let placed = shot.placed.as_ref()?;
     let image = &shot.keyframe.frame.image;
-    let intrinsics = match shot.keyframe.frame.intrinsics {
-        Some(known) => known,
-        None => shot.lens.resized(image.width_px, image.height_px),
-    };
     let to_picture = DVec2::new(
         f64::from(image.width_px) / f64::from(shot.lens.width_px),
         f64::from(image.height_px) / f64::from(shot.lens.height_px),
@@ -141,7 +138,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     Some(SparseView {
         keyframe_id: shot.keyframe.id,
         component: placed.component,
-        intrinsics,
+        intrinsics: scene.intrinsics_of(shot.keyframe.id)?,
         batch_from_cam: placed.cam_from_map.inverse(),
         health,
         landmarks,

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 
 use crate::camera::Intrinsics;
-use crate::frame::Keyframe;
+use crate::frame::{Keyframe, RgbImage};
 use crate::geometry::features::Features;
 use crate::geometry::matching::Wide;
 use crate::geometry::triangulate::Sight;
@@ -84,6 +84,18 @@ impl Scene {
         Some(Sight { cam_from_map: &placed.cam_from_map, intrinsics: &shot.lens, pixel: self.pixel(at) })
     }
 
+    /// Intrinsics at the size of the keyframe's picture.
+    pub(super) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
+        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        let frame = &shot.keyframe.frame;
+        Some(frame.intrinsics.unwrap_or_else(|| shot.lens.resized(frame.image.width_px, frame.image.height_px)))
+    }
+
+    pub(super) fn image_of(&self, keyframe_id: u32) -> Option<Arc<RgbImage>> {
+        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        Some(Arc::clone(&shot.keyframe.frame.image))
+    }
+
     pub(super) fn component_of(&self, shot_ix: usize) -> Option<u32> {
         self.shots[shot_ix].placed.as_ref().map(|p| p.component)
     }
@@ -95,6 +107,16 @@ impl Scene {
     pub(super) fn place(&mut self, shot_ix: usize, component: u32, cam_from_map: Rigid) {
         self.shots[shot_ix].placed = Some(Placed { component, cam_from_map });
         self.components[component as usize].shots.push(shot_ix);
+    }
+
+    /// The shot waits again; its sights go.
+    pub(super) fn unplace(&mut self, shot_ix: usize) {
+        for landmark in self.landmarks_of(&[shot_ix]) {
+            self.retain_sights(landmark, |s| s.0 as usize != shot_ix);
+        }
+        if let Some(placed) = self.shots[shot_ix].placed.take() {
+            self.components[placed.component as usize].shots.retain(|&s| s != shot_ix);
+        }
     }
 
     pub(super) fn add_landmark(&mut self, point: DVec3, component: u32, seen: Vec<(u32, u32)>) -> u32 {

@@ -98,7 +98,13 @@ fn ranked_pairs(scene: &mut Scene, waiting: &[usize], limits: &Limits) -> (Vec<(
 }
 
 /// Shots of the new component; `None` and no component where the scene does not hold.
-fn attempt(scene: &mut Scene, waiting: &[usize], (a, b): (usize, usize), min_shots: usize, limits: &Limits) -> Option<usize> {
+fn attempt(
+    scene: &mut Scene,
+    waiting: &[usize],
+    (a, b): (usize, usize),
+    min_shots: usize,
+    limits: &Limits,
+) -> Option<usize> {
     let (pose, _) = scene.links[&(a, b)].motion?;
     let component = scene.components.len() as u32;
     scene.components.push(Component::default());

@@ -54,6 +54,8 @@ struct Scratch {
     /// p, q, r blurred along rows.
     blurred: [Vec<f32>; 3],
     row_sums: Vec<[f64; 2]>,
+    /// Column of the depth map that each pixel of a row takes.
+    map_columns: Vec<usize>,
     zeros: Vec<f32>,
 }
 
@@ -237,15 +239,27 @@ fn window<'a>(plane: &'a [f32], y: usize, width: usize, zeros: &'a [f32]) -> Win
 
 /// Returns the depth loss before its weight.
 fn depth_gradient(raster: &Raster, map: &DepthMap, weight: f32, out: &mut PixelGradients) -> f64 {
-    let row_sums = &mut out.scratch.row_sums;
+    let Scratch {
+        row_sums,
+        map_columns,
+        ..
+    } = &mut out.scratch;
+    let map_width = map.width_px as usize;
+    map_columns.clear();
+    // floor((x + 0.5) * map_width / width) in integers.
+    map_columns
+        .extend((0..raster.width_px).map(|x| (2 * x + 1) * map_width / (2 * raster.width_px)));
+    let map_columns = &*map_columns;
     row_sums
         .par_iter_mut()
         .with_min_len(ROWS_PER_TASK)
         .enumerate()
         .for_each(|(y, sums)| {
-            let targets = (0..raster.width_px).filter_map(|x| depth_target(raster, map, x, y));
+            let confidences = depth_targets(raster, map, map_columns, y).flatten();
             *sums = [
-                targets.map(|(_, confidence)| f64::from(confidence)).sum(),
+                confidences
+                    .map(|(_, confidence)| f64::from(confidence))
+                    .sum(),
                 0.0,
             ];
         });
@@ -261,41 +275,48 @@ fn depth_gradient(raster: &Raster, map: &DepthMap, weight: f32, out: &mut PixelG
         depth_plane.par_chunks_mut(raster.stride),
         row_sums.par_iter_mut(),
     );
-    rows.into_par_iter()
-        .with_min_len(ROWS_PER_TASK)
-        .enumerate()
-        .for_each(|(y, (v_alpha, v_depth_sum, sums))| {
-            let (alpha, depth_sum) = (raster.row(3, y), raster.row(4, y));
-            for x in 0..raster.width_px {
-                let (mut v_a, mut v_d) = (0.0, 0.0);
-                if let Some((target, confidence)) = depth_target(raster, map, x, y)
-                    && alpha[x] > MIN_ALPHA_FOR_DEPTH
-                {
-                    let depth = depth_sum[x] / alpha[x];
-                    let error = target / depth - 1.0;
-                    let (huber, slope) = huber(error);
-                    sums[1] += f64::from(confidence) * f64::from(huber);
-                    let v_depth = -scale * confidence * slope * target / (depth * depth);
-                    v_d = v_depth / alpha[x];
-                    v_a = -v_depth * depth / alpha[x];
-                }
-                v_alpha[PLANE_MARGIN + x] = v_a;
-                v_depth_sum[PLANE_MARGIN + x] = v_d;
+    let rows = rows.into_par_iter().with_min_len(ROWS_PER_TASK).enumerate();
+    rows.for_each(|(y, (v_alpha, v_depth_sum, sums))| {
+        v_alpha.fill(0.0);
+        v_depth_sum.fill(0.0);
+        let (alpha, depth_sum) = (raster.row(3, y), raster.row(4, y));
+        for (x, target) in depth_targets(raster, map, map_columns, y).enumerate() {
+            let Some((target, confidence)) = target else {
+                continue;
+            };
+            if alpha[x] <= MIN_ALPHA_FOR_DEPTH {
+                continue;
             }
-        });
+            let depth = depth_sum[x] / alpha[x];
+            let (huber, slope) = huber(target / depth - 1.0);
+            sums[1] += f64::from(confidence) * f64::from(huber);
+            let v_depth = -scale * confidence * slope * target / (depth * depth);
+            v_depth_sum[PLANE_MARGIN + x] = v_depth / alpha[x];
+            v_alpha[PLANE_MARGIN + x] = -v_depth * depth / alpha[x];
+        }
+    });
     row_sums.iter().map(|sums| sums[1]).sum::<f64>() / confidence_sum
 }
 
-/// Depth and confidence wanted at a pixel, nearest neighbour.
-fn depth_target(raster: &Raster, map: &DepthMap, x: usize, y: usize) -> Option<(f32, f32)> {
+/// Depth and confidence wanted at the pixels of a row, nearest neighbour.
+fn depth_targets<'a>(
+    raster: &Raster,
+    map: &'a DepthMap,
+    map_columns: &'a [usize],
+    y: usize,
+) -> impl Iterator<Item = Option<(f32, f32)>> + 'a {
     let (map_width, map_height) = (map.width_px as usize, map.height_px as usize);
-    // floor((x + 0.5) * map_width / width) in integers.
-    let map_x = (2 * x + 1) * map_width / (2 * raster.width_px);
     let map_y = (2 * y + 1) * map_height / (2 * raster.height_px);
-    let ix = map_y * map_width + map_x;
-    let (depth, confidence) = (*map.depth.get(ix)?, *map.confidence.get(ix)?);
-    let is_usable = depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
-    is_usable.then_some((depth, confidence))
+    let row = map_y * map_width..(map_y + 1) * map_width;
+    // Empty when the map is shorter than it says.
+    let depths = map.depth.get(row.clone()).unwrap_or_default();
+    let confidences = map.confidence.get(row).unwrap_or_default();
+    map_columns.iter().map(|&x| {
+        let (depth, confidence) = (*depths.get(x)?, *confidences.get(x)?);
+        let is_usable =
+            depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
+        is_usable.then_some((depth, confidence))
+    })
 }
 
 /// Value and slope.

@@ -14,6 +14,7 @@ pub mod raster;
 pub mod raster_backward;
 mod sh;
 mod ssim;
+mod tile_splat;
 
 use adam::{Optimiser, retain_rows};
 use bin::Tiles;
@@ -40,6 +41,7 @@ pub struct CpuEngine {
     pass: Pass,
     stats: StepStats,
     n_skipped_updates: u64,
+    n_left_out: u64,
 }
 
 /// Gradient of one view's loss, for tests and diagnosis. Arrays as in `Splats`, 0 where a splat is not visible.
@@ -120,13 +122,21 @@ impl CpuEngine {
         self.n_skipped_updates
     }
 
-    fn count_skipped(&mut self, n: usize) {
-        if n > 0 && self.n_skipped_updates == 0 {
+    /// Warns of what went wrong in a step, once of each kind.
+    fn count_troubles(&mut self, n_skipped: usize) {
+        if n_skipped > 0 && self.n_skipped_updates == 0 {
             tracing::warn!(
-                "{n} gradients are not finite: their splats or poses are not updated; said once, counted on"
+                "{n_skipped} gradients are not finite: their splats or poses are not updated; said once"
             );
         }
-        self.n_skipped_updates += n as u64;
+        self.n_skipped_updates += n_skipped as u64;
+        let n_left_out = self.pass.tiles.n_left_out;
+        if n_left_out > 0 && self.n_left_out == 0 {
+            tracing::warn!(
+                "splats are too large: the {n_left_out} farthest of a view are left out; said once"
+            );
+        }
+        self.n_left_out += n_left_out as u64;
     }
 }
 
@@ -244,7 +254,7 @@ impl Engine for CpuEngine {
                 settings,
             );
         }
-        self.count_skipped(n_skipped);
+        self.count_troubles(n_skipped);
     }
 
     fn take_stats(&mut self) -> StepStats {
@@ -355,16 +365,13 @@ impl Splats {
 fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
-        if std::arch::is_x86_feature_detected!("avx512f")
-            && std::arch::is_x86_feature_detected!("avx512vl")
-        {
-            return "avx512";
+        use std::arch::is_x86_feature_detected as has;
+        if !has!("avx2") || !has!("fma") {
+            return "sse2";
         }
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma")
-        {
-            return "avx2+fma";
-        }
-        "sse2"
+        let has_avx512 =
+            has!("avx512f") && has!("avx512vl") && has!("avx512bw") && has!("avx512dq");
+        if has_avx512 { "avx512" } else { "avx2+fma" }
     }
     #[cfg(target_arch = "aarch64")]
     {

@@ -19,8 +19,8 @@ const PLAIN: Recipe = Recipe {
 /// All kinds of scenes: what makes it special, how many of it, how it is made from a seed.
 pub type Kind = (&'static str, u64, fn(u64) -> Scene);
 
-pub const KINDS: [Kind; 18] = [
-    ("plain", 50, |seed| {
+pub const KINDS: [Kind; 19] = [
+    ("plain", 44, |seed| {
         random::scene(
             seed,
             &Recipe {
@@ -64,6 +64,7 @@ pub const KINDS: [Kind; 18] = [
     ("not a number", 12, not_a_number),
     ("zero quaternions", 8, zero_quaternions),
     ("extreme opacities", 10, extreme_opacities),
+    ("absurd colours", 6, absurd_colours),
     ("no splats", 3, |seed| {
         random::scene(
             seed,
@@ -122,7 +123,7 @@ fn at_near_plane(seed: u64) -> Scene {
     );
     // Some map units from the origin f32 would keep only three digits of such depths.
     let map_from_cam = scene.view.cam_from_map.inverse();
-    let turn = if seed % 2 == 0 {
+    let turn = if seed.is_multiple_of(2) {
         scene.view.cam_from_map.rotation
     } else {
         DQuat::IDENTITY
@@ -133,7 +134,7 @@ fn at_near_plane(seed: u64) -> Scene {
             .to_array();
     }
     scene.view.cam_from_map.translation = DVec3::ZERO;
-    if seed % 2 == 0 {
+    if seed.is_multiple_of(2) {
         // No rounding, so that all must agree on a splat exactly at the plane.
         scene.view.cam_from_map.rotation = DQuat::IDENTITY;
         scene.splats.means[0] = [0.0, 0.0, 0.01];
@@ -199,6 +200,19 @@ fn extreme_opacities(seed: u64) -> Scene {
     scene
 }
 
+/// Too bright, too dark, and at the end of f32 in a band above 0.
+fn absurd_colours(seed: u64) -> Scene {
+    let mut scene = random::scene(seed, &PLAIN);
+    let stride = scene.splats.sh_stride();
+    for (ix, (coefficient, value)) in [(0, 6e4), (0, -6e4), (2, 1e20), (6, f32::MAX), (0, 5.0)]
+        .into_iter()
+        .enumerate()
+    {
+        scene.splats.sh[3 * ix * stride + 3 * coefficient] = value;
+    }
+    scene
+}
+
 fn many_overlapping(seed: u64) -> Scene {
     let faint = Recipe {
         opacity_logit: [-5.5, -2.0],
@@ -212,7 +226,14 @@ fn many_overlapping(seed: u64) -> Scene {
         size_px: [3.0, 20.0],
         ..PLAIN
     };
-    random::scene(seed, if seed % 2 == 0 { &faint } else { &dense })
+    random::scene(
+        seed,
+        if seed.is_multiple_of(2) {
+            &faint
+        } else {
+            &dense
+        },
+    )
 }
 
 /// All depths are equal as f32, so the index decides.

@@ -46,8 +46,6 @@ pub struct Camera {
 /// What a rendering is compared with.
 #[derive(Debug, Clone)]
 pub struct Target {
-    pub width_px: usize,
-    pub height_px: usize,
     /// 0 to 1, r g b per pixel.
     pub rgb: Vec<f64>,
     /// (depth, confidence) per picture pixel; (0, 0) where there is none.
@@ -141,12 +139,7 @@ impl Target {
                 )
             })
             .collect();
-        Self {
-            width_px,
-            height_px,
-            rgb,
-            depth,
-        }
+        Self { rgb, depth }
     }
 }
 

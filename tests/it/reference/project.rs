@@ -8,6 +8,8 @@ pub const NEAR: f64 = 0.01;
 /// Variance in px^2 added to each 2D Gaussian, so that none falls between pixel centres.
 pub const BLUR: f64 = 0.3;
 pub const MIN_OPACITY: f64 = 1.0 / 255.0;
+/// A colour beyond this is a broken splat; squared it would take a whole picture's SSIM with it.
+const MAX_COLOUR: f64 = 1e4;
 
 #[derive(Debug, Clone)]
 pub struct Projected {
@@ -120,6 +122,9 @@ fn project_one(
     let distance = from_centre.norm();
     let direction_in_map = from_centre / distance;
     let raw = colour(sh, direction_in_map);
+    if raw.amax() >= MAX_COLOUR {
+        return None;
+    }
     Some(Projected {
         splat_ix,
         mean_in_cam,
