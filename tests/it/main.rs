@@ -2,9 +2,6 @@
 #![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
-
-#[cfg(feature = "zenoh")]
-
 mod backends;
 mod bags;
 mod declared_lengths;
@@ -18,6 +15,7 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
+#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;
@@ -29,6 +27,7 @@ mod scenes;
 mod sfm;
 mod shaders;
 mod sources;
+mod steps;
 mod synthetic;
 mod synthetic_source;
 mod topics;
