@@ -34,14 +34,15 @@ impl RgbImage {
         self.resized(scaled(self.width_px), scaled(self.height_px))
     }
 
-    /// Area-averaged to another size, which may change the aspect.
+    /// Low-passed to another size, which may change the aspect. Not `FilterType::Box`: at fractional scales it moves
+    /// edges by a sixth of a pixel, Hamming by a fiftieth.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
         use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer, images};
         let source =
             images::ImageRef::new(self.width_px, self.height_px, &self.pixels, PixelType::U8x3)
                 .expect("three bytes per pixel");
         let mut target = images::Image::new(width_px, height_px, PixelType::U8x3);
-        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Box));
+        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Hamming));
         Resizer::new()
             .resize(&source, &mut target, &options)
             .expect("both pictures are U8x3");

@@ -236,3 +236,54 @@ fn root_bytes(histogram: &mut [f32; DESCRIPTOR_BYTES]) -> Descriptor {
     // A root of a share is below 1; 512 spreads the usual 0 to 0.4 over a byte.
     std::array::from_fn(|i| (512.0 * (histogram[i] / sum).sqrt()).min(255.0) as u8)
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec2;
+    use rand::{RngExt, SeedableRng};
+
+    use super::*;
+    use crate::geometry::matching::{Wide, matches};
+
+    /// Soft spots on grey: (x, y, sigma, height) each, coordinates with pixel centres at +0.5.
+    fn spots(width: usize, height: usize, spots: &[(f32, f32, f32, f32)]) -> Grey {
+        let value = |x: f32, y: f32| {
+            let one =
+                |s: &(f32, f32, f32, f32)| s.3 * (-((x - s.0).powi(2) + (y - s.1).powi(2)) / (2.0 * s.2 * s.2)).exp();
+            0.5 + spots.iter().map(one).sum::<f32>()
+        };
+        let pixels = (0..width * height).map(|i| value((i % width) as f32 + 0.5, (i / width) as f32 + 0.5)).collect();
+        Grey { width, height, pixels }
+    }
+
+    #[test]
+    fn a_spot_is_found_where_it_is_at_every_size() {
+        for (sigma, at) in [(1.5, (40.3, 33.8)), (3.0, (41.7, 30.2)), (6.0, (40.0, 32.5))] {
+            let found = features(&spots(90, 70, &[(at.0, at.1, sigma, 0.4)]), 10);
+            let truth = DVec2::new(f64::from(at.0), f64::from(at.1));
+            let off = found.pixels.first().map_or(f64::INFINITY, |p| p.distance(truth));
+            assert!(off < 0.1, "sigma {sigma}: {off} px off, {:?}", found.pixels.first());
+        }
+    }
+
+    #[test]
+    fn a_picture_turned_by_a_quarter_matches_itself() {
+        let mut rng = rand_pcg::Pcg32::seed_from_u64(4);
+        let mut spot = || {
+            let (x, y) = (rng.random_range(10.0..190.0), rng.random_range(10.0..150.0));
+            (x, y, rng.random_range(1.5..5.0), rng.random_range(-0.3..0.3))
+        };
+        let list: Vec<_> = (0..150).map(|_| spot()).collect();
+        let upright = spots(200, 160, &list);
+        let turned_list: Vec<_> = list.iter().map(|s| (160.0 - s.1, s.0, s.2, s.3)).collect();
+        let turned = spots(160, 200, &turned_list);
+        let (a, b) = (features(&upright, 300), features(&turned, 300));
+        let found = matches(&Wide::new(&a.descriptors), &Wide::new(&b.descriptors));
+        let is_right = |&&(i, j): &&(u32, u32)| {
+            let p = a.pixels[i as usize];
+            b.pixels[j as usize].distance(DVec2::new(160.0 - p.y, p.x)) < 0.5
+        };
+        let n_right = found.iter().filter(is_right).count();
+        assert!(n_right > 60 && 10 * n_right >= 9 * found.len(), "{n_right} of {} are right", found.len());
+    }
+}

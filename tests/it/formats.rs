@@ -96,7 +96,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         let written = checkpoint(n_splats, sh_degree);
         checkpoint::write(&written, &path).unwrap();
         let back = checkpoint::read(&path).unwrap();
-        assert_eq!(back.snapshot, written.snapshot);
+        assert!(back.snapshot == written.snapshot, "{n_splats} splats of degree {sh_degree}");
         assert_eq!((back.seed, back.steps), (11, 3000));
     }
 }
@@ -119,10 +119,11 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {
-        let fault = read_bytes(folder.path(), &bytes[..cut]).unwrap_err();
+        // Without the map itself, which fills screens when this fails.
+        let fault = read_bytes(folder.path(), &bytes[..cut]).map(|_| "half a map was read").unwrap_err();
         assert!(matches!(fault, CheckpointError::Damaged { .. }), "cut at {cut}: {fault}");
     }
-    read_bytes(folder.path(), &[&bytes[..], &[0]].concat()).unwrap_err();
+    assert!(read_bytes(folder.path(), &[&bytes[..], &[0]].concat()).is_err());
 }
 
 #[test]
@@ -187,7 +188,7 @@ fn a_section_of_the_future_is_skipped() {
     let section = [b"NEXT".to_vec(), 3_u64.to_le_bytes().to_vec(), b"abc".to_vec()].concat();
     bytes.extend(&section);
     bytes.extend(crc32c::crc32c(&section).to_le_bytes());
-    assert_eq!(read_bytes(folder.path(), &bytes).unwrap().snapshot, written.snapshot);
+    assert!(read_bytes(folder.path(), &bytes).unwrap().snapshot == written.snapshot);
 }
 
 #[test]

@@ -15,7 +15,6 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
-#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;

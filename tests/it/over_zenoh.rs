@@ -1,4 +1,5 @@
 //! Snapshots over zenoh: separate sessions on loopback, before and after the publisher, healthy, hostile and stalled.
+#![cfg(feature = "zenoh")]
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -81,7 +82,7 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
 
     let session = client("", &endpoints[0]);
     let received = ask(&session, "0/splat_mapper/**").expect("no snapshot");
-    assert_eq!(received, *snapshot);
+    assert!(received == *snapshot);
     let folder = tempfile::tempdir().unwrap();
     let paths = [folder.path().join("sent.ply"), folder.path().join("received.ply")];
     ply::write(&snapshot.splats, &paths[0]).unwrap();
@@ -127,7 +128,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
                 assert_eq!((attachment.len(), attachment[16]), (33, 16));
                 take(&mut assembler, &sample)
             });
-        assert_eq!(received.as_ref(), Some(&**snapshot));
+        assert!(received.as_ref() == Some(&**snapshot));
     }
     publisher.close().unwrap();
 }
@@ -144,7 +145,7 @@ fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
         // Answers nobody reads.
         drop(session.get("0/splat_mapper/**").payload(ix.to_le_bytes().to_vec()).wait().unwrap());
     }
-    assert_eq!(ask(&session, "0/splat_mapper/**").as_ref(), Some(&*snapshot));
+    assert!(ask(&session, "0/splat_mapper/**").as_ref() == Some(&*snapshot));
     publisher.close().unwrap();
 }
 
@@ -206,7 +207,7 @@ fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
         [snapshot(2), snapshot(3), Arc::clone(&last)].iter().for_each(|s| publisher.publish(s).unwrap());
         receiver.join().unwrap()
     });
-    assert_eq!(received.as_ref(), Some(&*last));
+    assert!(received.as_ref() == Some(&*last));
     assert!(started.secs() > 1.5, "{} s: nothing stalled, so nothing was tested", started.secs());
     // zenoh lingers ten seconds over bytes that the stalled peer never took; we do not.
     let closing = Stopwatch::start();
@@ -225,7 +226,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
     publisher.publish(&snapshot).unwrap();
     assert!(started.secs() < 5.0, "{} s with nobody there", started.secs());
-    assert_eq!(ask(&client(&endpoint, ""), "0/splat_mapper/**").as_ref(), Some(&*snapshot));
+    assert!(ask(&client(&endpoint, ""), "0/splat_mapper/**").as_ref() == Some(&*snapshot));
     publisher.close().unwrap();
 }
 
@@ -251,7 +252,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     assert_eq!(publisher.endpoints(), std::slice::from_ref(&endpoint));
     let snapshot = Arc::new(random_snapshot(20, 1, 0, 1));
     publisher.publish(&snapshot).unwrap();
-    assert_eq!(ask(&client("", &endpoint), "0/splat_mapper/**"), Some((*snapshot).clone()));
+    assert!(ask(&client("", &endpoint), "0/splat_mapper/**").as_ref() == Some(&*snapshot));
     publisher.close().unwrap();
 
     std::fs::write(&path, "{ listen: ").unwrap();

@@ -14,6 +14,7 @@ pub mod raster;
 pub mod raster_backward;
 mod sh;
 mod ssim;
+mod tile_splat;
 
 use adam::{Optimiser, retain_rows};
 use bin::Tiles;

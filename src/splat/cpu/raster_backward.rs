@@ -9,10 +9,8 @@ use super::bin::Tiles;
 use super::lanes::{LANES, Lane, madd};
 use super::loss::PixelGradients;
 use super::project::{ProjectedSplat, TILE_PX};
-use super::raster::{
-    BATCH, MIN_TRANSMITTANCE, PLANE_MARGIN, ROW_VECTORS, Raster, TILE_VECTORS, TileArea,
-    TilePixels, TileSplat, load_batch, start_transmittance,
-};
+use super::raster::{MIN_TRANSMITTANCE, PLANE_MARGIN, Raster, TilePixels, start_transmittance};
+use super::tile_splat::{BATCH, ROW_VECTORS, TILE_VECTORS, TileArea, TileSplat, load_batch};
 
 /// d loss / d one instance.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
