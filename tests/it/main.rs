@@ -2,7 +2,6 @@
 #![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
-
 mod backends;
 mod bags;
 mod declared_lengths;
@@ -16,7 +15,6 @@ mod html;
 mod layers;
 mod lenses;
 mod opening;
-#[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod pictures;
 mod publish;
@@ -28,6 +26,7 @@ mod scenes;
 mod sfm;
 mod shaders;
 mod sources;
+mod steps;
 mod synthetic;
 mod synthetic_source;
 mod topics;
