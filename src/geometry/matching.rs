@@ -63,7 +63,7 @@ pub fn matches(a: &Wide, b: &Wide) -> Vec<(u32, u32)> {
 fn nearest(a: &Wide, b: &Wide) -> (Vec<Nearest>, Vec<Nearest>) {
     let mut rows = vec![NOTHING; a.values.len()];
     let mut columns = vec![NOTHING; b.values.len()];
-    // Blocks of b stay in the first cache while rows of a pass, two at a time: that halves the loads (1.7 times faster).
+    // Blocks of b stay in the first cache while rows of a pass, two at a time: that saves loads.
     const BLOCK: usize = 64;
     for (block_ix, block) in b.values.chunks(BLOCK).enumerate() {
         for first in (0..a.values.len()).step_by(2) {
@@ -71,12 +71,7 @@ fn nearest(a: &Wide, b: &Wide) -> (Vec<Nearest>, Vec<Nearest>) {
             let (u, v) = (&a.values[first], &a.values[second]);
             for (k, other) in block.iter().enumerate() {
                 let j = block_ix * BLOCK + k;
-                let mut products = [0_i32; 2];
-                for i in 0..DESCRIPTOR_BYTES {
-                    let y = i32::from(other[i]);
-                    products[0] += i32::from(u[i]) * y;
-                    products[1] += i32::from(v[i]) * y;
-                }
+                let products = [dot(u, other), dot(v, other)];
                 for (i, product) in [first, second].into_iter().zip(products).take(second - first + 1) {
                     let square = a.squares[i] + b.squares[j] - 2 * product;
                     rows[i].offer(j, square);
@@ -88,6 +83,8 @@ fn nearest(a: &Wide, b: &Wide) -> (Vec<Nearest>, Vec<Nearest>) {
     (rows, columns)
 }
 
+/// This form, inlined, becomes one multiply-and-add instruction for 16 pairs; a plain loop over two rows does not.
+#[inline(always)]
 fn dot(a: &[i16; DESCRIPTOR_BYTES], b: &[i16; DESCRIPTOR_BYTES]) -> i32 {
     a.iter().zip(b).map(|(x, y)| i32::from(*x) * i32::from(*y)).sum()
 }

@@ -82,7 +82,7 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("kornia_imgproc", &["src/select", "src/geometry/", "src/source/"][..]),
         ("kornia_3d", &["src/geometry/"][..]),
         ("wgpu", &["src/gpu/"][..]),
-        ("multiversion", &["src/splat/cpu/", "src/geometry/mvs/"][..]),
+        ("multiversion", &["src/splat/cpu/", "src/geometry/"][..]),
     ])
 }
 
