@@ -31,6 +31,7 @@ impl Engine for Ramp {
         0
     }
     fn set_pose(&mut self, _: usize, _: Rigid) {}
+    fn set_depth(&mut self, _: usize, _: Option<std::sync::Arc<splat_mapper::frame::DepthMap>>) {}
     fn step(&mut self, _: usize, _: &StepSettings) {}
     fn take_stats(&mut self) -> StepStats {
         StepStats::default()
