@@ -5,7 +5,7 @@
 demo:
 	scripts/setup build
 	cargo build --release --locked
-	cargo run --release --locked --quiet -- replay recordings/demo.mcap --out out/demo
+	cargo run --release --locked --quiet -- replay recordings/demo.mcap --max-side 480 --steps 1500 --out out/demo
 	cargo run --release --locked --quiet -- eval out/demo --reference recordings/demo.tum
 	@echo "Look at out/demo/report.html; the map is out/demo/map.ply"
 

@@ -54,13 +54,21 @@ impl Watch {
         // domain / namespace / topic / type / hash
         let dds_type = sample.key_expr().as_str().rsplit('/').nth(1)?;
         if dds_type == dds_type_name::<PoseStamped>() {
-            let Ok(pose) = ros::decode::<PoseStamped>(&payload) else { return None };
+            let Ok(pose) = ros::decode::<PoseStamped>(&payload) else {
+                return None;
+            };
             let (p, q) = (pose.pose.position, pose.pose.orientation);
             let stamp = Stamp::from(pose.header.stamp);
-            println!("pose {stamp} {:.4} {:.4} {:.4}  {:.5} {:.5} {:.5} {:.5}", p.x, p.y, p.z, q.x, q.y, q.z, q.w);
+            println!(
+                "pose {stamp} {:.4} {:.4} {:.4}  {:.5} {:.5} {:.5} {:.5}",
+                p.x, p.y, p.z, q.x, q.y, q.z, q.w
+            );
             return None;
         }
-        let attachment = sample.attachment().map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default();
+        let attachment = sample
+            .attachment()
+            .map(|bytes| bytes.to_bytes().into_owned())
+            .unwrap_or_default();
         let gid = attachment.get(17..).unwrap_or_default();
         if dds_type.contains("SplatManifest") && gid != self.gid {
             self.gid = gid.to_vec();
@@ -73,15 +81,33 @@ impl Watch {
 fn main() -> Result<()> {
     let args = Args::parse();
     let mut config = Config::default();
-    let mut set = |key: &str, json: String| config.insert_json5(key, &json).map_err(|e| anyhow!("{key}: {e}"));
+    let mut set = |key: &str, json: String| {
+        config
+            .insert_json5(key, &json)
+            .map_err(|e| anyhow!("{key}: {e}"))
+    };
     set("listen/endpoints", "[]".to_owned())?;
-    set("scouting/multicast/enabled", args.connect.is_none().to_string())?;
-    set("connect/endpoints", serde_json::json!(args.connect.iter().collect::<Vec<_>>()).to_string())?;
-    let session = zenoh::open(config).wait().map_err(|e| anyhow!("cannot open zenoh: {e}"))?;
+    set(
+        "scouting/multicast/enabled",
+        args.connect.is_none().to_string(),
+    )?;
+    set(
+        "connect/endpoints",
+        serde_json::json!(args.connect.iter().collect::<Vec<_>>()).to_string(),
+    )?;
+    let session = zenoh::open(config)
+        .wait()
+        .map_err(|e| anyhow!("cannot open zenoh: {e}"))?;
     let key = format!("{}/{}/**", args.domain, args.namespace);
-    let live = session.declare_subscriber(&key).wait().map_err(|e| anyhow!("{key}: {e}"))?;
+    let live = session
+        .declare_subscriber(&key)
+        .wait()
+        .map_err(|e| anyhow!("{key}: {e}"))?;
 
-    let mut watch = Watch { assembler: Assembler::new(MAX_MAP_BYTES), gid: Vec::new() };
+    let mut watch = Watch {
+        assembler: Assembler::new(MAX_MAP_BYTES),
+        gid: Vec::new(),
+    };
     let mut has_snapshot = false;
     let mut quiet = Stopwatch::start();
     while quiet.secs() < args.timeout {
@@ -89,13 +115,24 @@ fn main() -> Result<()> {
         if !has_snapshot {
             // All chunks have one key: without this setting zenoh would keep only the last one.
             let query = session.get(&key).consolidation(ConsolidationMode::None);
-            let query = query.congestion_control(CongestionControl::Block).timeout(Duration::from_secs(10));
+            let query = query
+                .congestion_control(CongestionControl::Block)
+                .timeout(Duration::from_secs(10));
             let replies = query.wait().map_err(|e| anyhow!("{key}: {e}"))?;
-            samples.extend(replies.into_iter().filter_map(|reply| reply.into_result().ok()));
+            samples.extend(
+                replies
+                    .into_iter()
+                    .filter_map(|reply| reply.into_result().ok()),
+            );
         }
-        let one = live.recv_timeout(Duration::from_millis(500)).map_err(|e| anyhow!("zenoh ended: {e}"))?;
+        let one = live
+            .recv_timeout(Duration::from_millis(500))
+            .map_err(|e| anyhow!("zenoh ended: {e}"))?;
         samples.extend(one);
-        let snapshots: Vec<Snapshot> = samples.iter().filter_map(|sample| watch.take(sample)).collect();
+        let snapshots: Vec<Snapshot> = samples
+            .iter()
+            .filter_map(|sample| watch.take(sample))
+            .collect();
         for snapshot in snapshots {
             let (map, sha) = (&snapshot.splats, layout::map_sha256(&snapshot.splats));
             println!(
@@ -116,7 +153,10 @@ fn main() -> Result<()> {
         }
     }
     if !has_snapshot {
-        bail!("no map on {key} within {} s; does a mapper run with --set publish.zenoh=true?", args.timeout);
+        bail!(
+            "no map on {key} within {} s; does a mapper run with --set publish.zenoh=true?",
+            args.timeout
+        );
     }
     Ok(())
 }

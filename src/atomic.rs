@@ -6,7 +6,10 @@ use std::path::{Path, PathBuf};
 
 /// Fills `PATH.partial`, brings it to disk and renames it to `path`. A fault removes the partial file and leaves an
 /// older `path` as it was; a crash leaves at worst the partial file.
-pub fn write_file(path: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
+pub fn write_file(
+    path: &Path,
+    fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> io::Result<()> {
     let partial = partial_of(path);
     let written = fill_and_sync(&partial, fill).and_then(|()| std::fs::rename(&partial, path));
     if written.is_err() {
@@ -25,7 +28,10 @@ fn partial_of(path: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-fn fill_and_sync(partial: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> io::Result<()> {
+fn fill_and_sync(
+    partial: &Path,
+    fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> io::Result<()> {
     let mut writer = BufWriter::with_capacity(1 << 16, File::create(partial)?);
     fill(&mut writer)?;
     writer.flush()?;

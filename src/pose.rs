@@ -85,7 +85,11 @@ impl Rigid {
 
     /// Between `self` (share 0) and `other` (share 1): straight and at even speed, the short way round.
     pub fn between(&self, other: &Self, share: f64) -> Self {
-        let same_side = if self.rotation.dot(other.rotation) < 0.0 { -other.rotation } else { other.rotation };
+        let same_side = if self.rotation.dot(other.rotation) < 0.0 {
+            -other.rotation
+        } else {
+            other.rotation
+        };
         Self {
             rotation: self.rotation.slerp(same_side, share),
             translation: self.translation.lerp(other.translation, share),

@@ -11,8 +11,8 @@ use crate::eval::{doctor as checks, evaluation, render, trajectory};
 use crate::export::ply;
 use crate::map::checkpoint;
 use crate::node;
-use crate::source::synthetic::record::write_recording;
 use crate::source::synthetic::SynthSettings;
+use crate::source::synthetic::record::write_recording;
 use crate::splat::Splats;
 
 pub(super) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
@@ -31,8 +31,9 @@ pub(super) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
         }
     }
     for option in &args.set {
-        let (key, value) =
-            option.split_once('=').ok_or_else(|| Usage(format!("--set {option} is not key=value")))?;
+        let (key, value) = option
+            .split_once('=')
+            .ok_or_else(|| Usage(format!("--set {option} is not key=value")))?;
         settings.set(key, value)?;
     }
     let summary = write_recording(&settings, &args.out)?;
@@ -65,11 +66,24 @@ pub(super) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
     };
     let splats = read_map(&args.map)?;
     let intrinsics = render::read_intrinsics(&args.intrinsics)?;
-    let poses: Vec<_> =
-        trajectory::read_tum(&args.poses)?.into_iter().map(|timed| (timed.stamp, timed.pose)).collect();
+    let poses: Vec<_> = trajectory::read_tum(&args.poses)?
+        .into_iter()
+        .map(|timed| (timed.stamp, timed.pose))
+        .collect();
     let mut engine = node::engine(backend)?;
-    let n = render::render_poses(&splats, engine.as_mut(), &poses, &intrinsics, &args.out, args.depth)?;
-    say(format!("{n} pictures of {} splats: {}", splats.len(), args.out.display()));
+    let n = render::render_poses(
+        &splats,
+        engine.as_mut(),
+        &poses,
+        &intrinsics,
+        &args.out,
+        args.depth,
+    )?;
+    say(format!(
+        "{n} pictures of {} splats: {}",
+        splats.len(),
+        args.out.display()
+    ));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -77,17 +91,27 @@ pub(super) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let splats = read_map(&args.map)?;
     match args.out.extension().and_then(|e| e.to_str()) {
         Some("ply") => ply::write(&splats, &args.out)?,
-        other => bail!("this build exports .ply, not {:?}: {}", other.unwrap_or(""), args.out.display()),
+        other => bail!(
+            "this build exports .ply, not {:?}: {}",
+            other.unwrap_or(""),
+            args.out.display()
+        ),
     }
     say(format!("{} splats: {}", splats.len(), args.out.display()));
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn doctor() -> anyhow::Result<ExitCode> {
+pub(super) fn doctor() -> ExitCode {
     let found = checks::doctor();
     say(checks::format_checks(&found).trim_end());
-    let is_missing = found.iter().any(|check| check.state == checks::State::Missing);
-    Ok(if is_missing { ExitCode::FAILURE } else { ExitCode::SUCCESS })
+    let is_missing = found
+        .iter()
+        .any(|check| check.state == checks::State::Missing);
+    if is_missing {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    }
 }
 
 fn read_map(path: &Path) -> anyhow::Result<Splats> {
@@ -97,6 +121,10 @@ fn read_map(path: &Path) -> anyhow::Result<Splats> {
             let checkpoint = checkpoint::read(path)?;
             Ok(std::sync::Arc::unwrap_or_clone(checkpoint.snapshot.splats))
         }
-        _ => Err(Usage(format!("a map is a .splatmap or .ply file: {}", path.display()))).context("cannot read the map"),
+        _ => Err(Usage(format!(
+            "a map is a .splatmap or .ply file: {}",
+            path.display()
+        )))
+        .context("cannot read the map"),
     }
 }

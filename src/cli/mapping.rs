@@ -15,8 +15,10 @@ use crate::source;
 
 pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
     let mut settings = settings(&args.params)?;
-    if settings.params().map_err(usage)?.source.rate == 0.0 {
-        settings.set("source.rate", 1.0.into()).map_err(usage)?;
+    if settings.params().map_err(|e| usage(&e))?.source.rate == 0.0 {
+        settings
+            .set("source.rate", 1.0.into())
+            .map_err(|e| usage(&e))?;
     }
     map(&settings, &args.source, args.out.as_deref())
 }
@@ -26,9 +28,14 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let rate = match args.rate.as_deref() {
         None => None,
         Some("max") => Some(0.0),
-        Some(text) => Some(text.parse::<f64>().ok().filter(|rate| *rate > 0.0).ok_or_else(|| {
-            Usage(format!("--rate {text} is neither a number above 0 nor max"))
-        })?),
+        Some(text) => Some(
+            text.parse::<f64>()
+                .ok()
+                .filter(|rate| *rate > 0.0)
+                .ok_or_else(|| {
+                    Usage(format!("--rate {text} is neither a number above 0 nor max"))
+                })?,
+        ),
     };
     let flags: [(&str, Option<serde_json::Value>); 8] = [
         ("source.rate", rate.map(Into::into)),
@@ -42,7 +49,7 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     ];
     for (key, value) in flags {
         if let Some(value) = value {
-            settings.set(key, value).map_err(usage)?;
+            settings.set(key, value).map_err(|e| usage(&e))?;
         }
     }
     map(&settings, &args.input, args.out.as_deref())
@@ -54,17 +61,17 @@ fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
         settings.merge_file(file)?;
     }
     for setting in &args.set {
-        settings.merge_setting(setting).map_err(usage)?;
+        settings.merge_setting(setting).map_err(|e| usage(&e))?;
     }
     Ok(settings)
 }
 
-fn usage(error: ConfigError) -> Usage {
+fn usage(error: &ConfigError) -> Usage {
     Usage(error.to_string())
 }
 
 fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<ExitCode> {
-    let params = settings.params().map_err(usage)?;
+    let params = settings.params().map_err(|e| usage(&e))?;
     let is_terminal = std::io::stderr().is_terminal();
     if let Some(out) = out {
         run_dir::prepare(out)?;
@@ -75,7 +82,12 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     stop_on_ctrl_c(&stop)?;
     let subscriber: Option<Box<dyn Subscriber>> = subscriber(&params.publish)?;
     let is_live = params.source.rate > 0.0;
-    let job = Job { source, params: params.clone(), is_live, stop: stop.clone() };
+    let job = Job {
+        source,
+        params: params.clone(),
+        is_live,
+        stop: stop.clone(),
+    };
     let bar = bar(is_terminal);
     let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
     bar.finish_and_clear();
@@ -93,11 +105,21 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     }
     if outcome.snapshot.poses.is_empty() {
         let counts = &outcome.counts;
-        let fault = counts.fault.as_ref().map(|f| format!("; {f}")).unwrap_or_default();
+        let fault = counts
+            .fault
+            .as_ref()
+            .map(|f| format!("; {f}"))
+            .unwrap_or_default();
         let why = if outcome.n_selected == 0 {
-            format!("none of {} frames could be used ({} undecodable)", counts.received, counts.undecodable)
+            format!(
+                "none of {} frames could be used ({} undecodable)",
+                counts.received, counts.undecodable
+            )
         } else {
-            outcome.geometry_note.clone().unwrap_or_else(|| "no parallax was seen between keyframes".to_owned())
+            outcome
+                .geometry_note
+                .clone()
+                .unwrap_or_else(|| "no parallax was seen between keyframes".to_owned())
         };
         anyhow::bail!(
             "no map: {why}; {} of {} frames were keyframes{fault}; a map needs a camera that moves sideways past textured things: {input}",
@@ -112,7 +134,10 @@ fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {
         if stop.is_asked() {
-            #[expect(clippy::exit, reason = "the second Ctrl-C ends at once, whatever the stages do")]
+            #[expect(
+                clippy::exit,
+                reason = "the second Ctrl-C ends at once, whatever the stages do"
+            )]
             std::process::exit(130);
         }
         stop.ask();
@@ -134,7 +159,11 @@ fn show(bar: &ProgressBar, progress: Progress) {
         progress.n_placed, progress.n_keyframes, progress.n_splats
     );
     if bar.is_hidden() {
-        tracing::info!("step {} of {}: {text}", progress.n_steps, progress.steps_planned);
+        tracing::info!(
+            "step {} of {}: {text}",
+            progress.n_steps,
+            progress.steps_planned
+        );
     } else {
         bar.set_length(progress.steps_planned.max(progress.n_steps));
         bar.set_position(progress.n_steps);

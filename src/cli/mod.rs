@@ -170,14 +170,18 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => commands::eval(&args),
         Command::Render(args) => commands::render(&args),
         Command::Export(args) => commands::export(&args),
-        Command::Doctor => commands::doctor(),
+        Command::Doctor => Ok(commands::doctor()),
     };
     match result {
         Ok(code) => code,
         Err(error) => {
             // The one place where an error is printed; a closed stderr is no reason to fail differently.
             writeln!(std::io::stderr(), "splat-mapper: {error:#}").ok();
-            if error.is::<Usage>() { ExitCode::from(2) } else { ExitCode::FAILURE }
+            if error.is::<Usage>() {
+                ExitCode::from(2)
+            } else {
+                ExitCode::FAILURE
+            }
         }
     }
 }

@@ -137,7 +137,8 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
 
 fn shift_note(offset_nanos: i64) -> Option<String> {
     let secs = offset_nanos / 1_000_000_000;
-    (secs != 0).then(|| format!("the stamps of the run were shifted by {secs} s to meet the reference"))
+    (secs != 0)
+        .then(|| format!("the stamps of the run were shifted by {secs} s to meet the reference"))
 }
 
 fn join_notes(first: Option<String>, second: Option<String>) -> Option<String> {

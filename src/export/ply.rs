@@ -35,21 +35,32 @@ pub fn write(splats: &Splats, path: &Path) -> Result<(), ExportError> {
         }
         Ok(())
     })
-    .map_err(|e| ExportError::Write { reason: e.to_string(), path: path.to_owned() })
+    .map_err(|e| ExportError::Write {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    })
 }
 
 /// Reads a PLY of ours or another program's: properties in any order, more of them allowed, all of them f32.
 /// Asks for no more memory than the file has bytes.
 pub fn read(path: &Path) -> Result<Splats, ExportError> {
-    let io_fault = |e: io::Error| ExportError::Read { reason: e.to_string(), path: path.to_owned() };
-    let format_fault = |reason: String| ExportError::Format { reason, path: path.to_owned() };
+    let io_fault = |e: io::Error| ExportError::Read {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    };
+    let format_fault = |reason: String| ExportError::Format {
+        reason,
+        path: path.to_owned(),
+    };
     let file = File::open(path).map_err(io_fault)?;
     let file_info = file.metadata().map_err(io_fault)?;
     if !file_info.is_file() {
         return Err(io_fault(io::Error::other("not a regular file")));
     }
     let mut file = BufReader::new(file);
-    let (lines, header_bytes) = read_header(&mut file).map_err(io_fault)?.map_err(format_fault)?;
+    let (lines, header_bytes) = read_header(&mut file)
+        .map_err(io_fault)?
+        .map_err(format_fault)?;
     let table = parse_header(&lines).map_err(format_fault)?;
     let columns = Columns::find(&table.properties).map_err(format_fault)?;
     let expected_bytes = (table.n_vertices as u64).checked_mul(4 * table.properties.len() as u64);
@@ -74,15 +85,27 @@ fn n_rest_per_channel(sh_degree: u8) -> usize {
 }
 
 fn property_names(sh_degree: u8) -> Vec<String> {
-    let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
-    let mut all = names(&["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]);
+    let names = |names: &[&str]| {
+        names
+            .iter()
+            .map(|name| (*name).to_owned())
+            .collect::<Vec<_>>()
+    };
+    let mut all = names(&[
+        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2",
+    ]);
     all.extend((0..3 * n_rest_per_channel(sh_degree)).map(|ix| format!("f_rest_{ix}")));
-    all.extend(names(&["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]));
+    all.extend(names(&[
+        "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]));
     all
 }
 
 fn header(splats: &Splats) -> String {
-    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", splats.len());
+    let mut text = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}\n",
+        splats.len()
+    );
     for name in property_names(splats.sh_degree) {
         text.push_str("property float ");
         text.push_str(&name);
@@ -131,7 +154,10 @@ impl Columns {
             let found = properties.iter().position(|property| property == name);
             found.ok_or_else(|| format!("no property {name}"))
         };
-        let n_rest = properties.iter().filter(|name| name.starts_with("f_rest_")).count();
+        let n_rest = properties
+            .iter()
+            .filter(|name| name.starts_with("f_rest_"))
+            .count();
         let sh_degree = (0..=MAX_SH_DEGREE)
             .find(|degree| 3 * n_rest_per_channel(*degree) == n_rest)
             .ok_or_else(|| format!("{n_rest} properties f_rest_*, expected 0, 9, 24 or 45"))?;
@@ -139,13 +165,21 @@ impl Columns {
         let per_channel = n_rest_per_channel(sh_degree);
         for coefficient in 0..per_channel {
             for channel in 0..3 {
-                sh.push(column(&format!("f_rest_{}", channel * per_channel + coefficient))?);
+                sh.push(column(&format!(
+                    "f_rest_{}",
+                    channel * per_channel + coefficient
+                ))?);
             }
         }
         Ok(Self {
             mean: [column("x")?, column("y")?, column("z")?],
             log_scale: [column("scale_0")?, column("scale_1")?, column("scale_2")?],
-            quat: [column("rot_0")?, column("rot_1")?, column("rot_2")?, column("rot_3")?],
+            quat: [
+                column("rot_0")?,
+                column("rot_1")?,
+                column("rot_2")?,
+                column("rot_3")?,
+            ],
             opacity_logit: column("opacity")?,
             sh,
             sh_degree,
@@ -163,7 +197,9 @@ fn read_header(file: &mut impl BufRead) -> io::Result<Result<(Vec<String>, u64),
         line.clear();
         n_bytes += limited.read_until(b'\n', &mut line)? as u64;
         if line.last() != Some(&b'\n') {
-            return Ok(Err(format!("no line end_header in the first {n_bytes} bytes")));
+            return Ok(Err(format!(
+                "no line end_header in the first {n_bytes} bytes"
+            )));
         }
         // Comments may be in any encoding; what matters is plain ASCII.
         let text = String::from_utf8_lossy(&line).trim_end().to_owned();
@@ -189,14 +225,21 @@ fn parse_header(lines: &[String]) -> Result<Table, String> {
             ["format", "binary_little_endian", "1.0"] => format_is_known = true,
             ["format", ..] => return Err(format!("{line:?}, expected binary_little_endian 1.0")),
             ["element", "vertex", count] if table.is_none() => {
-                let n_vertices = count.parse().map_err(|e| format!("{line:?} counts nothing: {e}"))?;
-                table = Some(Table { n_vertices, properties: Vec::new() });
+                let n_vertices = count
+                    .parse()
+                    .map_err(|e| format!("{line:?} counts nothing: {e}"))?;
+                table = Some(Table {
+                    n_vertices,
+                    properties: Vec::new(),
+                });
             }
             // Whatever stands behind the vertices is no splat.
             ["element", ..] if table.is_some() => break,
             ["element", ..] => return Err(format!("{line:?} stands before the vertices")),
             ["property", "float" | "float32", name] => {
-                let table = table.as_mut().ok_or_else(|| format!("{line:?} belongs to no element"))?;
+                let table = table
+                    .as_mut()
+                    .ok_or_else(|| format!("{line:?} belongs to no element"))?;
                 if table.properties.len() == MAX_PROPERTIES {
                     return Err(format!("more than {MAX_PROPERTIES} properties"));
                 }
@@ -215,7 +258,10 @@ fn parse_header(lines: &[String]) -> Result<Table, String> {
 
 fn read_rows(file: &mut impl Read, table: &Table, columns: &Columns) -> io::Result<Splats> {
     let n_columns = table.properties.len();
-    let mut splats = Splats { sh_degree: columns.sh_degree, ..Splats::default() };
+    let mut splats = Splats {
+        sh_degree: columns.sh_degree,
+        ..Splats::default()
+    };
     let mut bytes = vec![0; 4 * n_columns * ROWS_AT_ONCE.min(table.n_vertices)];
     let mut numbers = vec![0.0; bytes.len() / 4];
     let mut n_left = table.n_vertices;

@@ -57,14 +57,22 @@ pub struct Report {
 pub fn adjust(problem: &mut Problem, settings: &Settings) -> Report {
     let layout = Layout::new(problem, settings.refine_focal);
     let mut cost = total_cost(problem, settings.loss_px);
-    let mut report = Report { cost_before: cost, cost_after: cost, n_steps: 0 };
+    let mut report = Report {
+        cost_before: cost,
+        cost_after: cost,
+        n_steps: 0,
+    };
     let (mut damping, mut growth) = (1e-4, 2.0);
     let mut system = None;
     for _ in 0..settings.max_steps {
         report.n_steps += 1;
-        let normal = system.take().unwrap_or_else(|| linearise(problem, &layout, settings.loss_px));
+        let normal = system
+            .take()
+            .unwrap_or_else(|| linearise(problem, &layout, settings.loss_px));
         let candidate = step(problem, &layout, &normal, damping);
-        let new_cost = candidate.as_ref().map_or(f64::INFINITY, |c| total_cost(c, settings.loss_px));
+        let new_cost = candidate
+            .as_ref()
+            .map_or(f64::INFINITY, |c| total_cost(c, settings.loss_px));
         if let Some(candidate) = candidate.filter(|_| new_cost < cost) {
             *problem = candidate;
             let gain = (cost - new_cost) / cost.max(1e-300);
@@ -105,7 +113,11 @@ impl Layout {
         };
         let offset = problem.cameras.iter().map(place).collect();
         let has_focal = refine_focal && problem.cameras.iter().any(|c| c.shares_focal);
-        Self { offset, focal: has_focal.then_some(n), n: n + usize::from(has_focal) }
+        Self {
+            offset,
+            focal: has_focal.then_some(n),
+            n: n + usize::from(has_focal),
+        }
     }
 
     /// Columns of one camera's seven parameters; `None` for those held.
@@ -134,9 +146,16 @@ struct Normal {
 }
 
 fn linearise(problem: &Problem, _layout: &Layout, loss_px: f64) -> Normal {
-    let rotations: Vec<DMat3> = problem.cameras.iter().map(|c| c.cam_from_map.rotation_matrix()).collect();
+    let rotations: Vec<DMat3> = problem
+        .cameras
+        .iter()
+        .map(|c| c.cam_from_map.rotation_matrix())
+        .collect();
     let block = |(point, seen): (&DVec3, &Vec<Observation>)| {
-        let rows: Vec<Row> = seen.iter().filter_map(|o| row(problem, &rotations, *point, o, loss_px)).collect();
+        let rows: Vec<Row> = seen
+            .iter()
+            .filter_map(|o| row(problem, &rotations, *point, o, loss_px))
+            .collect();
         let mut v = Matrix3::zeros();
         let mut g = Vector3::zeros();
         for r in &rows {
@@ -145,10 +164,23 @@ fn linearise(problem: &Problem, _layout: &Layout, loss_px: f64) -> Normal {
         }
         PointBlock { rows, v, g }
     };
-    Normal { blocks: problem.points.par_iter().zip(&problem.observations).map(block).collect() }
+    Normal {
+        blocks: problem
+            .points
+            .par_iter()
+            .zip(&problem.observations)
+            .map(block)
+            .collect(),
+    }
 }
 
-fn row(problem: &Problem, rotations: &[DMat3], point: DVec3, seen: &Observation, loss_px: f64) -> Option<Row> {
+fn row(
+    problem: &Problem,
+    rotations: &[DMat3],
+    point: DVec3,
+    seen: &Observation,
+    loss_px: f64,
+) -> Option<Row> {
     let camera = &problem.cameras[seen.camera_ix];
     let p = rotations[seen.camera_ix] * point + camera.cam_from_map.translation;
     let image = camera.intrinsics.project(p)?;
@@ -174,9 +206,17 @@ fn row(problem: &Problem, rotations: &[DMat3], point: DVec3, seen: &Observation,
         fy * y,
     ]);
     let turn = rotations[seen.camera_ix].transpose();
-    let (du, dv) = (turn * DVec3::new(fx * iz, 0.0, -fx * x * iz), turn * DVec3::new(0.0, fy * iz, -fy * y * iz));
+    let (du, dv) = (
+        turn * DVec3::new(fx * iz, 0.0, -fx * x * iz),
+        turn * DVec3::new(0.0, fy * iz, -fy * y * iz),
+    );
     let by_point = SMatrix::<f64, 2, 3>::new(du.x, du.y, du.z, dv.x, dv.y, dv.z);
-    Some(Row { camera_ix: seen.camera_ix, by_camera, by_point, residual: SVector::<f64, 2>::new(w * r.x, w * r.y) })
+    Some(Row {
+        camera_ix: seen.camera_ix,
+        by_camera,
+        by_point,
+        residual: SVector::<f64, 2>::new(w * r.x, w * r.y),
+    })
 }
 
 /// Solves the damped reduced system and applies the step; `None` where it is not positive definite.
@@ -224,13 +264,20 @@ fn eliminate(
     damping: f64,
     (s, b): (&mut DMatrix<f64>, &mut DVector<f64>),
 ) {
-    let Some(inverse) = damped(&block.v, damping) else { return };
-    let cross: Vec<SMatrix<f64, PARAMS, 3>> = block.rows.iter().map(|r| r.by_camera.transpose() * r.by_point).collect();
+    let Some(inverse) = damped(&block.v, damping) else {
+        return;
+    };
+    let cross: Vec<SMatrix<f64, PARAMS, 3>> = block
+        .rows
+        .iter()
+        .map(|r| r.by_camera.transpose() * r.by_point)
+        .collect();
     let columns: Vec<[Option<usize>; PARAMS]> = block
         .rows
         .iter()
         .map(|r| {
-            let (pose, focal) = layout.columns(r.camera_ix, problem.cameras[r.camera_ix].shares_focal);
+            let (pose, focal) =
+                layout.columns(r.camera_ix, problem.cameras[r.camera_ix].shares_focal);
             std::array::from_fn(|i| if i < 6 { pose.map(|p| p + i) } else { focal })
         })
         .collect();
@@ -272,7 +319,13 @@ fn add(
     }
 }
 
-fn apply(problem: &Problem, layout: &Layout, normal: &Normal, delta: &DVector<f64>, damping: f64) -> Problem {
+fn apply(
+    problem: &Problem,
+    layout: &Layout,
+    normal: &Normal,
+    delta: &DVector<f64>,
+    damping: f64,
+) -> Problem {
     let mut out = problem.clone();
     let focal_step = layout.focal.map_or(0.0, |i| delta[i].clamp(-0.3, 0.3));
     for (camera, offset) in out.cameras.iter_mut().zip(&layout.offset) {
@@ -288,36 +341,53 @@ fn apply(problem: &Problem, layout: &Layout, normal: &Normal, delta: &DVector<f6
             camera.intrinsics.fy *= focal_step.exp();
         }
     }
-    out.points.par_iter_mut().zip(&normal.blocks).for_each(|(point, block)| {
-        let Some(inverse) = damped(&block.v, damping) else { return };
-        let mut right = block.g;
-        for row in &block.rows {
-            let (pose, focal) = layout.columns(row.camera_ix, problem.cameras[row.camera_ix].shares_focal);
-            let part = SVector::<f64, PARAMS>::from_fn(|i, _| {
-                let column = if i < 6 { pose.map(|p| p + i) } else { focal };
-                column.map_or(0.0, |c| delta[c])
-            });
-            right += row.by_point.transpose() * (row.by_camera * part);
-        }
-        let moved = inverse * right;
-        *point -= DVec3::new(moved[0], moved[1], moved[2]);
-    });
+    out.points
+        .par_iter_mut()
+        .zip(&normal.blocks)
+        .for_each(|(point, block)| {
+            let Some(inverse) = damped(&block.v, damping) else {
+                return;
+            };
+            let mut right = block.g;
+            for row in &block.rows {
+                let (pose, focal) =
+                    layout.columns(row.camera_ix, problem.cameras[row.camera_ix].shares_focal);
+                let part = SVector::<f64, PARAMS>::from_fn(|i, _| {
+                    let column = if i < 6 { pose.map(|p| p + i) } else { focal };
+                    column.map_or(0.0, |c| delta[c])
+                });
+                right += row.by_point.transpose() * (row.by_camera * part);
+            }
+            let moved = inverse * right;
+            *point -= DVec3::new(moved[0], moved[1], moved[2]);
+        });
     out
 }
 
 /// Cauchy's loss over all observations; a point behind a camera costs as much as one 100 losses away.
 fn total_cost(problem: &Problem, loss_px: f64) -> f64 {
-    let rotations: Vec<DMat3> = problem.cameras.iter().map(|c| c.cam_from_map.rotation_matrix()).collect();
+    let rotations: Vec<DMat3> = problem
+        .cameras
+        .iter()
+        .map(|c| c.cam_from_map.rotation_matrix())
+        .collect();
     let cost = |(point, seen): (&DVec3, &Vec<Observation>)| -> f64 {
         let one = |o: &Observation| {
             let camera = &problem.cameras[o.camera_ix];
-            let image = camera.intrinsics.project(rotations[o.camera_ix] * *point + camera.cam_from_map.translation);
+            let image = camera
+                .intrinsics
+                .project(rotations[o.camera_ix] * *point + camera.cam_from_map.translation);
             let square = image.map_or(1e4 * loss_px * loss_px, |p| p.distance_squared(o.pixel));
             loss_px * loss_px * (1.0 + square / (loss_px * loss_px)).ln()
         };
         seen.iter().map(one).sum()
     };
-    let costs: Vec<f64> = problem.points.par_iter().zip(&problem.observations).map(cost).collect();
+    let costs: Vec<f64> = problem
+        .points
+        .par_iter()
+        .zip(&problem.observations)
+        .map(cost)
+        .collect();
     costs.iter().sum()
 }
 

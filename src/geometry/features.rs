@@ -33,11 +33,17 @@ pub struct Features {
 
 /// The grey picture that features are found on: the longer side is at most `max_side`.
 pub fn working_picture(image: &RgbImage, max_side: u32) -> Grey {
-    let luma =
-        |p: &[u8]| (77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) as f32 / (256.0 * 255.0);
+    let luma = |p: &[u8]| {
+        (77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) as f32
+            / (256.0 * 255.0)
+    };
     let (w, h) = (image.width_px, image.height_px);
     let pixels: Vec<f32> = image.pixels.chunks_exact(3).map(luma).collect();
-    let full = Grey { width: w as usize, height: h as usize, pixels };
+    let full = Grey {
+        width: w as usize,
+        height: h as usize,
+        pixels,
+    };
     let (small_w, small_h) = working_size(w, h, max_side);
     if (small_w, small_h) == (w, h) || full.pixels.len() != full.width * full.height {
         return full;
@@ -50,13 +56,17 @@ pub fn working_size(width_px: u32, height_px: u32, max_side: u32) -> (u32, u32) 
     if longest <= max_side {
         return (width_px, height_px);
     }
-    let scaled = |side: u32| ((f64::from(side) * f64::from(max_side) / f64::from(longest)).round() as u32).max(1);
+    let scaled = |side: u32| {
+        ((f64::from(side) * f64::from(max_side) / f64::from(longest)).round() as u32).max(1)
+    };
     (scaled(width_px), scaled(height_px))
 }
 
 /// At most `max_features` points of a picture. Pictures below 24 pixels on a side have none.
 pub fn features(picture: &Grey, max_features: usize) -> Features {
-    if picture.width.min(picture.height) < 24 || picture.pixels.len() != picture.width * picture.height {
+    if picture.width.min(picture.height) < 24
+        || picture.pixels.len() != picture.width * picture.height
+    {
         return Features::default();
     }
     let octaves = pyramid(picture);
@@ -69,7 +79,10 @@ pub fn features(picture: &Grey, max_features: usize) -> Features {
         .map(|blob| {
             let layer = &octaves[blob.octave].layers[blob.layer];
             let describe = |angle| (*blob, descriptor(layer, blob, angle, &weights));
-            orientations(layer, blob).into_iter().map(describe).collect()
+            orientations(layer, blob)
+                .into_iter()
+                .map(describe)
+                .collect()
         })
         .collect();
     let mut out = Features::default();
@@ -93,7 +106,8 @@ impl Features {
         // nothing in the coordinates of octave 0 counted at integers.
         let to_first = |v: f32| f64::from(v * octave.step * 2.0);
         let to_input = |v: f32| (to_first(v) + 0.5) * 0.5;
-        self.pixels.push(glam::DVec2::new(to_input(blob.x), to_input(blob.y)));
+        self.pixels
+            .push(glam::DVec2::new(to_input(blob.x), to_input(blob.y)));
         self.sigmas.push(blob.sigma * octave.step);
         self.descriptors.push(descriptor);
     }
@@ -101,14 +115,28 @@ impl Features {
 
 fn resized(full: &Grey, width: u32, height: u32) -> Option<Grey> {
     let bytes: Vec<u8> = full.pixels.iter().flat_map(|v| v.to_ne_bytes()).collect();
-    let source =
-        fir::images::Image::from_vec_u8(full.width as u32, full.height as u32, bytes, fir::PixelType::F32).ok()?;
+    let source = fir::images::Image::from_vec_u8(
+        full.width as u32,
+        full.height as u32,
+        bytes,
+        fir::PixelType::F32,
+    )
+    .ok()?;
     let mut target = fir::images::Image::new(width, height, fir::PixelType::F32);
-    let options = fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Hamming));
-    fir::Resizer::new().resize(&source, &mut target, &options).ok()?;
+    let options =
+        fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Hamming));
+    fir::Resizer::new()
+        .resize(&source, &mut target, &options)
+        .ok()?;
     let words = target.buffer().chunks_exact(4);
-    let pixels = words.map(|b| f32::from_ne_bytes([b[0], b[1], b[2], b[3]])).collect();
-    Some(Grey { width: width as usize, height: height as usize, pixels })
+    let pixels = words
+        .map(|b| f32::from_ne_bytes([b[0], b[1], b[2], b[3]]))
+        .collect();
+    Some(Grey {
+        width: width as usize,
+        height: height as usize,
+        pixels,
+    })
 }
 
 /// Main directions of the gradient around a blob: the strongest, and a second one at 80 % of it or more.
@@ -122,22 +150,29 @@ fn orientations(layer: &Grey, blob: &Blob) -> Vec<f32> {
             let (ux, uy) = (x as usize, y as usize);
             let dx = layer.at(ux + 1, uy) - layer.at(ux - 1, uy);
             let dy = layer.at(ux, uy + 1) - layer.at(ux, uy - 1);
-            let away = ((x as f32 - blob.x).powi(2) + (y as f32 - blob.y).powi(2)) / (2.0 * spread * spread);
+            let away = ((x as f32 - blob.x).powi(2) + (y as f32 - blob.y).powi(2))
+                / (2.0 * spread * spread);
             let turn = turns(dy, dx) * ORIENTATION_BINS as f32;
-            histogram[turn as usize % ORIENTATION_BINS] += (-away).exp() * (dx * dx + dy * dy).sqrt();
+            histogram[turn as usize % ORIENTATION_BINS] +=
+                (-away).exp() * (dx * dx + dy * dy).sqrt();
         }
     }
     let n = ORIENTATION_BINS;
     for _ in 0..2 {
         let before = histogram;
         for i in 0..n {
-            histogram[i] = 0.25 * before[(i + n - 1) % n] + 0.5 * before[i] + 0.25 * before[(i + 1) % n];
+            histogram[i] =
+                0.25 * before[(i + n - 1) % n] + 0.5 * before[i] + 0.25 * before[(i + 1) % n];
         }
     }
     let highest = histogram.iter().copied().fold(0.0, f32::max);
     let mut peaks: Vec<(f32, f32)> = Vec::new();
     for i in 0..n {
-        let (left, here, right) = (histogram[(i + n - 1) % n], histogram[i], histogram[(i + 1) % n]);
+        let (left, here, right) = (
+            histogram[(i + n - 1) % n],
+            histogram[i],
+            histogram[(i + 1) % n],
+        );
         if here > left && here >= right && here >= 0.8 * highest {
             let peak = i as f32 + 0.5 + 0.5 * (left - right) / (left - 2.0 * here + right);
             peaks.push((here, peak / n as f32 * std::f32::consts::TAU));
@@ -184,7 +219,8 @@ impl CellWeights {
                 for (k, slot) in share.iter_mut().enumerate() {
                     let (bx, by) = (x + 0.5 * CELLS as f32 - 0.5, y + 0.5 * CELLS as f32 - 0.5);
                     let (cx, cy) = (bx.floor() + (k % 2) as f32, by.floor() + (k / 2) as f32);
-                    let inside = (0.0..CELLS as f32).contains(&cx) && (0.0..CELLS as f32).contains(&cy);
+                    let inside =
+                        (0.0..CELLS as f32).contains(&cx) && (0.0..CELLS as f32).contains(&cy);
                     if inside {
                         let weight = (1.0 - (bx - cx).abs()) * (1.0 - (by - cy).abs()) * gaussian;
                         *slot = (cy as usize * CELLS + cx as usize, weight);
@@ -205,13 +241,19 @@ fn descriptor(layer: &Grey, blob: &Blob, angle: f32, weights: &CellWeights) -> D
     for (i, out) in patch.iter_mut().enumerate() {
         let u = ((i % SIDE) as f32 - 0.5 * (SIDE - 1) as f32) * spacing;
         let v = ((i / SIDE) as f32 - 0.5 * (SIDE - 1) as f32) * spacing;
-        *out = layer.sample(blob.x + cosine * u - sine * v, blob.y + sine * u + cosine * v);
+        *out = layer.sample(
+            blob.x + cosine * u - sine * v,
+            blob.y + sine * u + cosine * v,
+        );
     }
     let mut histogram = [0.0_f32; DESCRIPTOR_BYTES];
     for row in 0..GRID {
         for column in 0..GRID {
             let at = (row + 1) * SIDE + column + 1;
-            let (dx, dy) = (patch[at + 1] - patch[at - 1], patch[at + SIDE] - patch[at - SIDE]);
+            let (dx, dy) = (
+                patch[at + 1] - patch[at - 1],
+                patch[at + SIDE] - patch[at - SIDE],
+            );
             let magnitude = (dx * dx + dy * dy).sqrt();
             let turn = turns(dy, dx) * DIRECTIONS as f32;
             let (bin, part) = (turn as usize, turn - turn.floor());
@@ -228,7 +270,12 @@ fn descriptor(layer: &Grey, blob: &Blob, angle: f32, weights: &CellWeights) -> D
 
 /// Clips what one strong edge may contribute, then takes square roots so that the dot product is Hellinger's.
 fn root_bytes(histogram: &mut [f32; DESCRIPTOR_BYTES]) -> Descriptor {
-    let length = histogram.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
+    let length = histogram
+        .iter()
+        .map(|v| v * v)
+        .sum::<f32>()
+        .sqrt()
+        .max(1e-12);
     for v in histogram.iter_mut() {
         *v = (*v / length).min(0.2);
     }
@@ -248,21 +295,39 @@ mod tests {
     /// Soft spots on grey: (x, y, sigma, height) each, coordinates with pixel centres at +0.5.
     fn spots(width: usize, height: usize, spots: &[(f32, f32, f32, f32)]) -> Grey {
         let value = |x: f32, y: f32| {
-            let one =
-                |s: &(f32, f32, f32, f32)| s.3 * (-((x - s.0).powi(2) + (y - s.1).powi(2)) / (2.0 * s.2 * s.2)).exp();
+            let one = |s: &(f32, f32, f32, f32)| {
+                s.3 * (-((x - s.0).powi(2) + (y - s.1).powi(2)) / (2.0 * s.2 * s.2)).exp()
+            };
             0.5 + spots.iter().map(one).sum::<f32>()
         };
-        let pixels = (0..width * height).map(|i| value((i % width) as f32 + 0.5, (i / width) as f32 + 0.5)).collect();
-        Grey { width, height, pixels }
+        let pixels = (0..width * height)
+            .map(|i| value((i % width) as f32 + 0.5, (i / width) as f32 + 0.5))
+            .collect();
+        Grey {
+            width,
+            height,
+            pixels,
+        }
     }
 
     #[test]
     fn a_spot_is_found_where_it_is_at_every_size() {
-        for (sigma, at) in [(1.5, (40.3, 33.8)), (3.0, (41.7, 30.2)), (6.0, (40.0, 32.5))] {
+        for (sigma, at) in [
+            (1.5, (40.3, 33.8)),
+            (3.0, (41.7, 30.2)),
+            (6.0, (40.0, 32.5)),
+        ] {
             let found = features(&spots(90, 70, &[(at.0, at.1, sigma, 0.4)]), 10);
             let truth = DVec2::new(f64::from(at.0), f64::from(at.1));
-            let off = found.pixels.first().map_or(f64::INFINITY, |p| p.distance(truth));
-            assert!(off < 0.1, "sigma {sigma}: {off} px off, {:?}", found.pixels.first());
+            let off = found
+                .pixels
+                .first()
+                .map_or(f64::INFINITY, |p| p.distance(truth));
+            assert!(
+                off < 0.1,
+                "sigma {sigma}: {off} px off, {:?}",
+                found.pixels.first()
+            );
         }
     }
 
@@ -271,7 +336,12 @@ mod tests {
         let mut rng = rand_pcg::Pcg32::seed_from_u64(4);
         let mut spot = || {
             let (x, y) = (rng.random_range(10.0..190.0), rng.random_range(10.0..150.0));
-            (x, y, rng.random_range(1.5..5.0), rng.random_range(-0.3..0.3))
+            (
+                x,
+                y,
+                rng.random_range(1.5..5.0),
+                rng.random_range(-0.3..0.3),
+            )
         };
         let list: Vec<_> = (0..150).map(|_| spot()).collect();
         let upright = spots(200, 160, &list);
@@ -284,6 +354,10 @@ mod tests {
             b.pixels[j as usize].distance(DVec2::new(160.0 - p.y, p.x)) < 0.5
         };
         let n_right = found.iter().filter(is_right).count();
-        assert!(n_right > 60 && 10 * n_right >= 9 * found.len(), "{n_right} of {} are right", found.len());
+        assert!(
+            n_right > 60 && 10 * n_right >= 9 * found.len(),
+            "{n_right} of {} are right",
+            found.len()
+        );
     }
 }

@@ -25,14 +25,20 @@ const GAP: f64 = 0.03;
 pub fn focal_share(pairs: &[PairView], longest_px: f64) -> Option<f64> {
     let step = (SHARES.1 / SHARES.0).ln() / (N_GRID - 1) as f64;
     let share = |i: usize| SHARES.0 * (step * i as f64).exp();
-    let costs: Vec<f64> = (0..N_GRID).map(|i| cost(pairs, share(i) * longest_px)).collect();
+    let costs: Vec<f64> = (0..N_GRID)
+        .map(|i| cost(pairs, share(i) * longest_px))
+        .collect();
     let best = (1..N_GRID - 1).min_by(|&a, &b| costs[a].total_cmp(&costs[b]))?;
     if pairs.is_empty() || costs[best] > costs[0].min(costs[N_GRID - 1]) {
         return None;
     }
     let (left, here, right) = (costs[best - 1], costs[best], costs[best + 1]);
     let bend = left - 2.0 * here + right;
-    let offset = if bend > 1e-12 { (0.5 * (left - right) / bend).clamp(-1.0, 1.0) } else { 0.0 };
+    let offset = if bend > 1e-12 {
+        (0.5 * (left - right) / bend).clamp(-1.0, 1.0)
+    } else {
+        0.0
+    };
     Some(share(best) * (step * offset).exp())
 }
 
@@ -64,13 +70,21 @@ mod tests {
     /// Pairs of a camera of the given focal length; the share `wrong` of them says nothing about it.
     fn pairs(focal: f64, wrong: f64) -> Vec<PairView> {
         let mut rng = rand_pcg::Pcg32::seed_from_u64(3);
-        let mut vector = |size: f64| DVec3::from_array([(); 3].map(|()| rng.random_range(-size..size)));
+        let mut vector =
+            |size: f64| DVec3::from_array([(); 3].map(|()| rng.random_range(-size..size)));
         (0..40)
             .map(|i| {
                 let pose = Rigid::exp(vector(1.0), vector(0.4));
-                let f = if f64::from(i) < 40.0 * wrong { focal * (0.4 + 0.05 * f64::from(i)) } else { focal };
+                let f = if f64::from(i) < 40.0 * wrong {
+                    focal * (0.4 + 0.05 * f64::from(i))
+                } else {
+                    focal
+                };
                 let k = DMat3::from_diagonal(DVec3::new(1.0 / f, 1.0 / f, 1.0));
-                PairView { fundamental: k * skew(pose.translation) * pose.rotation_matrix() * k, weight: 1.0 }
+                PairView {
+                    fundamental: k * skew(pose.translation) * pose.rotation_matrix() * k,
+                    weight: 1.0,
+                }
             })
             .collect()
     }
@@ -79,7 +93,10 @@ mod tests {
     fn the_focal_length_is_found_among_misleading_pairs() {
         for share in [0.5, 0.72, 1.3] {
             let found = focal_share(&pairs(share * 640.0, 0.3), 640.0).unwrap();
-            assert!((found / share - 1.0).abs() < 0.01, "{found} instead of {share}");
+            assert!(
+                (found / share - 1.0).abs() < 0.01,
+                "{found} instead of {share}"
+            );
         }
     }
 

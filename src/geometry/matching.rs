@@ -18,7 +18,8 @@ pub struct Wide {
 
 impl Wide {
     pub fn new(descriptors: &[Descriptor]) -> Self {
-        let values: Vec<[i16; DESCRIPTOR_BYTES]> = descriptors.iter().map(|d| d.map(i16::from)).collect();
+        let values: Vec<[i16; DESCRIPTOR_BYTES]> =
+            descriptors.iter().map(|d| d.map(i16::from)).collect();
         let squares = values.iter().map(|v| dot(v, v)).collect();
         Self { values, squares }
     }
@@ -31,13 +32,21 @@ struct Nearest {
     second: i32,
 }
 
-const NOTHING: Nearest = Nearest { ix: u32::MAX, square: i32::MAX, second: i32::MAX };
+const NOTHING: Nearest = Nearest {
+    ix: u32::MAX,
+    square: i32::MAX,
+    second: i32::MAX,
+};
 
 impl Nearest {
     #[inline]
     fn offer(&mut self, ix: usize, square: i32) {
         if square < self.square {
-            *self = Self { ix: ix as u32, square, second: self.square };
+            *self = Self {
+                ix: ix as u32,
+                square,
+                second: self.square,
+            };
         } else if square < self.second {
             self.second = square;
         }
@@ -72,7 +81,11 @@ fn nearest(a: &Wide, b: &Wide) -> (Vec<Nearest>, Vec<Nearest>) {
             for (k, other) in block.iter().enumerate() {
                 let j = block_ix * BLOCK + k;
                 let products = [dot(u, other), dot(v, other)];
-                for (i, product) in [first, second].into_iter().zip(products).take(second - first + 1) {
+                for (i, product) in [first, second]
+                    .into_iter()
+                    .zip(products)
+                    .take(second - first + 1)
+                {
                     let square = a.squares[i] + b.squares[j] - 2 * product;
                     rows[i].offer(j, square);
                     columns[j].offer(i, square);
@@ -86,7 +99,10 @@ fn nearest(a: &Wide, b: &Wide) -> (Vec<Nearest>, Vec<Nearest>) {
 /// This form, inlined, becomes one multiply-and-add instruction for 16 pairs; a plain loop over two rows does not.
 #[inline(always)]
 fn dot(a: &[i16; DESCRIPTOR_BYTES], b: &[i16; DESCRIPTOR_BYTES]) -> i32 {
-    a.iter().zip(b).map(|(x, y)| i32::from(*x) * i32::from(*y)).sum()
+    a.iter()
+        .zip(b)
+        .map(|(x, y)| i32::from(*x) * i32::from(*y))
+        .sum()
 }
 
 #[cfg(test)]
@@ -97,14 +113,19 @@ mod tests {
 
     fn random_descriptors(n: usize, seed: u64) -> Vec<Descriptor> {
         let mut rng = rand_pcg::Pcg32::seed_from_u64(seed);
-        (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0..90))).collect()
+        (0..n)
+            .map(|_| std::array::from_fn(|_| rng.random_range(0..90)))
+            .collect()
     }
 
     #[test]
     fn noisy_copies_find_each_other_and_strangers_find_nobody() {
         let a = random_descriptors(300, 1);
         let mut rng = rand_pcg::Pcg32::seed_from_u64(2);
-        let mut b: Vec<Descriptor> = a[..200].iter().map(|d| d.map(|v| v + rng.random_range(0..8))).collect();
+        let mut b: Vec<Descriptor> = a[..200]
+            .iter()
+            .map(|d| d.map(|v| v + rng.random_range(0..8)))
+            .collect();
         b.reverse();
         b.extend(random_descriptors(100, 3));
         let found = matches(&Wide::new(&a), &Wide::new(&b));
@@ -119,6 +140,9 @@ mod tests {
         assert!(matches(&Wide::new(&a), &Wide::new(&twice)).is_empty());
         assert!(matches(&Wide::new(&a), &Wide::new(&[])).is_empty());
         // With one candidate there is no second best to compare with: mutual and near is enough.
-        assert_eq!(matches(&Wide::new(&a[..1]), &Wide::new(&a[..1])), vec![(0, 0)]);
+        assert_eq!(
+            matches(&Wide::new(&a[..1]), &Wide::new(&a[..1])),
+            vec![(0, 0)]
+        );
     }
 }

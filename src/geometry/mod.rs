@@ -1,16 +1,16 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
-pub mod known;
-pub mod mvs;
-pub mod scale_space;
+pub mod bundle;
 pub mod features;
+pub mod focal;
+pub mod known;
 pub mod matching;
+pub mod mvs;
+pub mod pnp;
+pub mod scale_space;
+pub mod sfm;
 pub mod triangulate;
 pub mod two_view;
-pub mod pnp;
-pub mod focal;
-pub mod bundle;
-pub mod sfm;
 
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};

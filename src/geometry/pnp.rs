@@ -32,7 +32,10 @@ pub fn place(
     if n < min_inliers.max(4) || n != pixels.len() {
         return None;
     }
-    let rays: Vec<DVec3> = pixels.iter().map(|p| camera.ray_in_cam(*p).normalize()).collect();
+    let rays: Vec<DVec3> = pixels
+        .iter()
+        .map(|p| camera.ray_in_cam(*p).normalize())
+        .collect();
     let mut rng = Pcg32::seed_from_u64(seed);
     let mut best: Option<(f64, Rigid)> = None;
     let mut tries = MAX_TRIES;
@@ -65,28 +68,46 @@ pub fn place(
         let pairs: Vec<(DVec3, DVec2)> = inliers.iter().map(picked).collect();
         pose = refine(&pairs, camera, &pose, max_error_px);
     }
-    Some(Placement { cam_from_map: pose, inliers })
+    Some(Placement {
+        cam_from_map: pose,
+        inliers,
+    })
 }
 
 /// Gauss-Newton on the reprojection error under Cauchy's loss.
-pub fn refine(pairs: &[(DVec3, DVec2)], camera: &Intrinsics, start: &Rigid, scale_px: f64) -> Rigid {
+pub fn refine(
+    pairs: &[(DVec3, DVec2)],
+    camera: &Intrinsics,
+    start: &Rigid,
+    scale_px: f64,
+) -> Rigid {
     let mut pose = *start;
     for _ in 0..8 {
         let mut hessian = Matrix6::<f64>::zeros();
         let mut gradient = Vector6::<f64>::zeros();
         for (point, pixel) in pairs {
             let p = pose.transform_point(*point);
-            let Some(image) = camera.project(p) else { continue };
+            let Some(image) = camera.project(p) else {
+                continue;
+            };
             let residual = image - *pixel;
             let weight = 1.0 / (1.0 + residual.length_squared() / (scale_px * scale_px));
-            for (row, r) in jacobian(camera, p).into_iter().zip([residual.x, residual.y]) {
+            for (row, r) in jacobian(camera, p)
+                .into_iter()
+                .zip([residual.x, residual.y])
+            {
                 hessian += weight * row * row.transpose();
                 gradient += weight * r * row;
             }
         }
         let damped = hessian + Matrix6::identity() * (1e-9 * hessian.trace());
-        let Some(step) = damped.cholesky().map(|c| -c.solve(&gradient)) else { break };
-        pose = (Rigid::exp(DVec3::new(step[0], step[1], step[2]), DVec3::new(step[3], step[4], step[5])) * pose)
+        let Some(step) = damped.cholesky().map(|c| -c.solve(&gradient)) else {
+            break;
+        };
+        pose = (Rigid::exp(
+            DVec3::new(step[0], step[1], step[2]),
+            DVec3::new(step[3], step[4], step[5]),
+        ) * pose)
             .renormalized();
         if step.norm() < 1e-10 {
             break;
@@ -100,18 +121,50 @@ fn jacobian(camera: &Intrinsics, p: DVec3) -> [Vector6<f64>; 2] {
     let (x, y, iz) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
     let (fx, fy) = (camera.fx, camera.fy);
     [
-        Vector6::new(fx * iz, 0.0, -fx * x * iz, -fx * x * y, fx * (1.0 + x * x), -fx * y),
-        Vector6::new(0.0, fy * iz, -fy * y * iz, -fy * (1.0 + y * y), fy * x * y, fy * x),
+        Vector6::new(
+            fx * iz,
+            0.0,
+            -fx * x * iz,
+            -fx * x * y,
+            fx * (1.0 + x * x),
+            -fx * y,
+        ),
+        Vector6::new(
+            0.0,
+            fy * iz,
+            -fy * y * iz,
+            -fy * (1.0 + y * y),
+            fy * x * y,
+            fy * x,
+        ),
     ]
 }
 
-fn agreeing(points: &[DVec3], pixels: &[DVec2], camera: &Intrinsics, pose: &Rigid, max_error_px: f64) -> Vec<usize> {
-    let error = |i: usize| camera.project(pose.transform_point(points[i])).map(|p| p.distance(pixels[i]));
-    (0..points.len()).filter(|&i| error(i).is_some_and(|e| e <= max_error_px)).collect()
+fn agreeing(
+    points: &[DVec3],
+    pixels: &[DVec2],
+    camera: &Intrinsics,
+    pose: &Rigid,
+    max_error_px: f64,
+) -> Vec<usize> {
+    let error = |i: usize| {
+        camera
+            .project(pose.transform_point(points[i]))
+            .map(|p| p.distance(pixels[i]))
+    };
+    (0..points.len())
+        .filter(|&i| error(i).is_some_and(|e| e <= max_error_px))
+        .collect()
 }
 
 /// Squared errors, each at most the squared limit (MSAC).
-fn truncated_cost(points: &[DVec3], pixels: &[DVec2], camera: &Intrinsics, pose: &Rigid, max_error_px: f64) -> f64 {
+fn truncated_cost(
+    points: &[DVec3],
+    pixels: &[DVec2],
+    camera: &Intrinsics,
+    pose: &Rigid,
+    max_error_px: f64,
+) -> f64 {
     let rotation = pose.rotation_matrix();
     let limit = max_error_px * max_error_px;
     let error = |(point, pixel): (&DVec3, &DVec2)| {
@@ -123,8 +176,17 @@ fn truncated_cost(points: &[DVec3], pixels: &[DVec2], camera: &Intrinsics, pose:
 
 /// Poses (at most four) that put three points on three unit rays.
 fn three_point(points: [DVec3; 3], rays: [DVec3; 3]) -> Vec<Rigid> {
-    let [a2, b2, c2] = [points[1] - points[2], points[0] - points[2], points[0] - points[1]].map(DVec3::length_squared);
-    let [ca, cb, cg] = [rays[1].dot(rays[2]), rays[0].dot(rays[2]), rays[0].dot(rays[1])];
+    let [a2, b2, c2] = [
+        points[1] - points[2],
+        points[0] - points[2],
+        points[0] - points[1],
+    ]
+    .map(DVec3::length_squared);
+    let [ca, cb, cg] = [
+        rays[1].dot(rays[2]),
+        rays[0].dot(rays[2]),
+        rays[0].dot(rays[1]),
+    ];
     if a2.min(b2).min(c2) < 1e-18 {
         return Vec::new();
     }
@@ -144,7 +206,11 @@ fn three_point(points: [DVec3; 3], rays: [DVec3; 3]) -> Vec<Rigid> {
         let square = b2 / (1.0 + v * v - 2.0 * v * cb);
         if below.abs() > 1e-12 && u > 0.0 && square > 0.0 {
             let first = square.sqrt();
-            let in_cam = [rays[0] * first, rays[1] * (u * first), rays[2] * (v * first)];
+            let in_cam = [
+                rays[0] * first,
+                rays[1] * (u * first),
+                rays[2] * (v * first),
+            ];
             poses.extend(aligned(points, in_cam));
         }
     }
@@ -210,23 +276,36 @@ mod tests {
 
     #[test]
     fn the_pose_is_found_among_forty_percent_wrong_pairs() {
-        let camera = Intrinsics { width_px: 640, height_px: 480, fx: 500.0, fy: 510.0, cx: 322.0, cy: 237.0 };
+        let camera = Intrinsics {
+            width_px: 640,
+            height_px: 480,
+            fx: 500.0,
+            fy: 510.0,
+            cx: 322.0,
+            cy: 237.0,
+        };
         let truth = Rigid::exp(DVec3::new(0.3, -0.2, 1.0), DVec3::new(0.2, -0.4, 0.1));
         let mut rng = Pcg32::seed_from_u64(5);
         let (mut points, mut pixels) = (Vec::new(), Vec::new());
         while points.len() < 100 {
-            let point = DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::Z * 4.0;
+            let point =
+                DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::Z * 4.0;
             if let Some(pixel) = camera.project(truth.transform_point(point)) {
                 let noise = DVec2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
                 let wrong = points.len() % 5 < 2;
-                let anywhere = DVec2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0));
+                let anywhere =
+                    DVec2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0));
                 pixels.push(if wrong { anywhere } else { pixel + noise });
                 points.push(point);
             }
         }
         let found = place(&points, &pixels, &camera, (2.0, 30), 1).unwrap();
         assert!(found.inliers.len() >= 58, "{} inliers", found.inliers.len());
-        assert!(found.cam_from_map.angle_to(&truth) < 2e-3, "{}", found.cam_from_map.angle_to(&truth));
+        assert!(
+            found.cam_from_map.angle_to(&truth) < 2e-3,
+            "{}",
+            found.cam_from_map.angle_to(&truth)
+        );
         assert!(found.cam_from_map.translation.distance(truth.translation) < 1e-2);
         assert!(place(&points[..4], &pixels[..4], &camera, (2.0, 30), 1).is_none());
     }
@@ -240,7 +319,10 @@ mod tests {
             let in_cam = [vector(), vector(), vector()].map(|v| v + DVec3::Z * 3.0);
             let points = in_cam.map(|p| truth.inverse().transform_point(p));
             let answers = three_point(points, in_cam.map(DVec3::normalize));
-            let best = answers.iter().map(|p| p.angle_to(&truth)).fold(f64::INFINITY, f64::min);
+            let best = answers
+                .iter()
+                .map(|p| p.angle_to(&truth))
+                .fold(f64::INFINITY, f64::min);
             assert!(best < 1e-5, "seed {seed}: {best} of {}", answers.len());
         }
     }

@@ -68,19 +68,30 @@ impl Grey {
     fn doubled(&self) -> Self {
         let (width, height) = (self.width * 2, self.height * 2);
         let mut pixels = vec![0.0; width * height];
-        pixels.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-            for (x, out) in row.iter_mut().enumerate() {
-                *out = self.sample((x as f32 + 0.5) * 0.5 - 0.5, (y as f32 + 0.5) * 0.5 - 0.5);
-            }
-        });
-        Self { width, height, pixels }
+        pixels
+            .par_chunks_mut(width)
+            .enumerate()
+            .for_each(|(y, row)| {
+                for (x, out) in row.iter_mut().enumerate() {
+                    *out = self.sample((x as f32 + 0.5) * 0.5 - 0.5, (y as f32 + 0.5) * 0.5 - 0.5);
+                }
+            });
+        Self {
+            width,
+            height,
+            pixels,
+        }
     }
 
     /// Every second pixel.
     fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
         let rows = (0..height).flat_map(|y| (0..width).map(move |x| (2 * x, 2 * y)));
-        Self { width, height, pixels: rows.map(|(x, y)| self.at(x, y)).collect() }
+        Self {
+            width,
+            height,
+            pixels: rows.map(|(x, y)| self.at(x, y)).collect(),
+        }
     }
 
     fn blurred(&self, sigma: f32) -> Self {
@@ -88,14 +99,23 @@ impl Grey {
         let radius = kernel.len() / 2;
         let (w, h) = (self.width, self.height);
         let mut across = vec![0.0_f32; w * h];
-        across.par_chunks_mut(w).zip(self.pixels.par_chunks(w)).for_each(|(out, row)| blur_row(row, &kernel, out));
+        across
+            .par_chunks_mut(w)
+            .zip(self.pixels.par_chunks(w))
+            .for_each(|(out, row)| blur_row(row, &kernel, out));
         let mut pixels = vec![0.0_f32; w * h];
         pixels.par_chunks_mut(w).enumerate().for_each(|(y, out)| {
             let row_of = |k: usize| mirrored(y as isize + k as isize - radius as isize, h) * w;
-            let rows: Vec<&[f32]> = (0..kernel.len()).map(|k| &across[row_of(k)..row_of(k) + w]).collect();
+            let rows: Vec<&[f32]> = (0..kernel.len())
+                .map(|k| &across[row_of(k)..row_of(k) + w])
+                .collect();
             weighted_sum(&rows, &kernel, out);
         });
-        Self { width: w, height: h, pixels }
+        Self {
+            width: w,
+            height: h,
+            pixels,
+        }
     }
 }
 
@@ -120,7 +140,11 @@ pub fn pyramid(picture: &Grey) -> Vec<Octave> {
 
 /// Extrema of the differences of neighbouring layers, refined to parts of a pixel, in a fixed order.
 pub fn blobs(octaves: &[Octave]) -> Vec<Blob> {
-    octaves.iter().enumerate().flat_map(|(ix, octave)| blobs_of_octave(ix, octave)).collect()
+    octaves
+        .iter()
+        .enumerate()
+        .flat_map(|(ix, octave)| blobs_of_octave(ix, octave))
+        .collect()
 }
 
 fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
@@ -129,19 +153,33 @@ fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
         .layers
         .par_windows(2)
         .map(|pair| {
-            let pixels = pair[1].pixels.iter().zip(&pair[0].pixels).map(|(a, b)| a - b).collect();
-            Grey { width: w, height: h, pixels }
+            let pixels = pair[1]
+                .pixels
+                .iter()
+                .zip(&pair[0].pixels)
+                .map(|(a, b)| a - b)
+                .collect();
+            Grey {
+                width: w,
+                height: h,
+                pixels,
+            }
         })
         .collect();
-    let rows = (1..=LAYERS).flat_map(|layer| (BORDER..h.saturating_sub(BORDER)).map(move |y| (layer, y)));
+    let rows =
+        (1..=LAYERS).flat_map(|layer| (BORDER..h.saturating_sub(BORDER)).map(move |y| (layer, y)));
     let rows: Vec<(usize, usize)> = rows.collect();
     let found: Vec<Vec<Blob>> = rows
         .par_iter()
         .map(|&(layer, y)| {
-            let candidates = (BORDER..w - BORDER).filter(|&x| is_extremum(&differences, layer, x, y));
+            let candidates =
+                (BORDER..w - BORDER).filter(|&x| is_extremum(&differences, layer, x, y));
             candidates
                 .filter_map(|x| refined(&differences, layer, x, y))
-                .map(|b| Blob { octave: octave_ix, ..b })
+                .map(|b| Blob {
+                    octave: octave_ix,
+                    ..b
+                })
                 .collect()
         })
         .collect();
@@ -154,7 +192,9 @@ fn layer_sigma(layer: usize) -> f32 {
 
 fn gaussian(sigma: f32) -> Vec<f32> {
     let radius = (3.5 * sigma).ceil() as i32;
-    let raw: Vec<f32> = (-radius..=radius).map(|x| (-0.5 * (x as f32 / sigma).powi(2)).exp()).collect();
+    let raw: Vec<f32> = (-radius..=radius)
+        .map(|x| (-0.5 * (x as f32 / sigma).powi(2)).exp())
+        .collect();
     let sum: f32 = raw.iter().sum();
     raw.iter().map(|v| v / sum).collect()
 }
@@ -173,7 +213,9 @@ fn mirrored(i: isize, n: usize) -> usize {
 
 fn blur_row(row: &[f32], kernel: &[f32], out: &mut [f32]) {
     let (w, radius) = (row.len(), kernel.len() / 2);
-    let padded: Vec<f32> = (0..w + 2 * radius).map(|i| row[mirrored(i as isize - radius as isize, w)]).collect();
+    let padded: Vec<f32> = (0..w + 2 * radius)
+        .map(|i| row[mirrored(i as isize - radius as isize, w)])
+        .collect();
     let shifted: Vec<&[f32]> = (0..kernel.len()).map(|k| &padded[k..k + w]).collect();
     weighted_sum(&shifted, kernel, out);
 }
@@ -194,7 +236,11 @@ fn weighted_sum(rows: &[&[f32]], weights: &[f32], out: &mut [f32]) {
         out[start..start + STRETCH].copy_from_slice(&sum);
     }
     for i in n - n % STRETCH..n {
-        out[i] = rows.iter().zip(weights).map(|(row, weight)| weight * row[i]).sum();
+        out[i] = rows
+            .iter()
+            .zip(weights)
+            .map(|(row, weight)| weight * row[i])
+            .sum();
     }
 }
 
@@ -204,9 +250,19 @@ fn is_extremum(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
     if centre.abs() < 0.5 * MIN_CONTRAST {
         return false;
     }
-    let beats = |other: f32| if centre > 0.0 { centre >= other } else { centre <= other };
+    let beats = |other: f32| {
+        if centre > 0.0 {
+            centre >= other
+        } else {
+            centre <= other
+        }
+    };
     [layer, layer - 1, layer + 1].into_iter().all(|l| {
-        (y - 1..=y + 1).all(|row| differences[l].pixels[row * w + x - 1..row * w + x + 2].iter().all(|&v| beats(v)))
+        (y - 1..=y + 1).all(|row| {
+            differences[l].pixels[row * w + x - 1..row * w + x + 2]
+                .iter()
+                .all(|&v| beats(v))
+        })
     })
 }
 
@@ -214,7 +270,11 @@ fn is_extremum(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
 fn refined(differences: &[Grey], mut layer: usize, mut x: usize, mut y: usize) -> Option<Blob> {
     let (w, h) = (differences[0].width, differences[0].height);
     for _ in 0..4 {
-        let (below, here, above) = (&differences[layer - 1], &differences[layer], &differences[layer + 1]);
+        let (below, here, above) = (
+            &differences[layer - 1],
+            &differences[layer],
+            &differences[layer + 1],
+        );
         let c = here.at(x, y);
         let gradient = [
             0.5 * (here.at(x + 1, y) - here.at(x - 1, y)),
@@ -225,24 +285,52 @@ fn refined(differences: &[Grey], mut layer: usize, mut x: usize, mut y: usize) -
         let yy = here.at(x, y + 1) + here.at(x, y - 1) - 2.0 * c;
         let ss = above.at(x, y) + below.at(x, y) - 2.0 * c;
         let mixed = |a: f32, b: f32, c: f32, d: f32| 0.25 * (a - b - c + d);
-        let xy = mixed(here.at(x + 1, y + 1), here.at(x - 1, y + 1), here.at(x + 1, y - 1), here.at(x - 1, y - 1));
-        let xs = mixed(above.at(x + 1, y), above.at(x - 1, y), below.at(x + 1, y), below.at(x - 1, y));
-        let ys = mixed(above.at(x, y + 1), above.at(x, y - 1), below.at(x, y + 1), below.at(x, y - 1));
+        let xy = mixed(
+            here.at(x + 1, y + 1),
+            here.at(x - 1, y + 1),
+            here.at(x + 1, y - 1),
+            here.at(x - 1, y - 1),
+        );
+        let xs = mixed(
+            above.at(x + 1, y),
+            above.at(x - 1, y),
+            below.at(x + 1, y),
+            below.at(x - 1, y),
+        );
+        let ys = mixed(
+            above.at(x, y + 1),
+            above.at(x, y - 1),
+            below.at(x, y + 1),
+            below.at(x, y - 1),
+        );
         let hessian = nalgebra::Matrix3::new(xx, xy, xs, xy, yy, ys, xs, ys, ss);
         let offset = -(hessian.try_inverse()? * nalgebra::Vector3::from(gradient));
         if offset.iter().all(|o| o.abs() <= 0.6) {
-            let contrast = c + 0.5 * (gradient[0] * offset[0] + gradient[1] * offset[1] + gradient[2] * offset[2]);
+            let contrast = c + 0.5
+                * (gradient[0] * offset[0] + gradient[1] * offset[1] + gradient[2] * offset[2]);
             let (trace, det) = (xx + yy, xx * yy - xy * xy);
-            let is_edge = det <= 0.0 || trace * trace * MAX_EDGE_RATIO >= (MAX_EDGE_RATIO + 1.0).powi(2) * det;
+            let is_edge = det <= 0.0
+                || trace * trace * MAX_EDGE_RATIO >= (MAX_EDGE_RATIO + 1.0).powi(2) * det;
             if contrast.abs() < MIN_CONTRAST || is_edge {
                 return None;
             }
             let sigma = BASE_SIGMA * ((layer as f32 + offset[2]) / LAYERS as f32).exp2();
             let (x, y) = (x as f32 + offset[0], y as f32 + offset[1]);
-            return Some(Blob { octave: 0, layer, x, y, sigma, contrast: contrast.abs() });
+            return Some(Blob {
+                octave: 0,
+                layer,
+                x,
+                y,
+                sigma,
+                contrast: contrast.abs(),
+            });
         }
         let moved = |v: usize, by: f32| (v as f32 + by.clamp(-1.0, 1.0).round()) as usize;
-        (x, y, layer) = (moved(x, offset[0]), moved(y, offset[1]), moved(layer, offset[2]));
+        (x, y, layer) = (
+            moved(x, offset[0]),
+            moved(y, offset[1]),
+            moved(layer, offset[2]),
+        );
         let inside = x >= BORDER && y >= BORDER && x < w - BORDER && y < h - BORDER;
         if !inside || !(1..=LAYERS).contains(&layer) {
             return None;

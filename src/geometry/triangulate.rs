@@ -25,7 +25,9 @@ impl Sight<'_> {
 
     /// Distance in pixels between the point's image and the sight; infinite behind the camera.
     pub fn error_px(&self, point_in_map: DVec3) -> f64 {
-        let image = self.intrinsics.project(self.cam_from_map.transform_point(point_in_map));
+        let image = self
+            .intrinsics
+            .project(self.cam_from_map.transform_point(point_in_map));
         image.map_or(f64::INFINITY, |pixel| pixel.distance(self.pixel))
     }
 }
@@ -53,9 +55,17 @@ pub fn triangulate(sights: &[Sight<'_>]) -> Option<DVec3> {
 
 /// Largest angle in radians between any two rays to the point.
 pub fn widest_angle(centres: &[DVec3], point: DVec3) -> f64 {
-    let rays: Vec<DVec3> = centres.iter().map(|c| (point - *c).normalize_or_zero()).collect();
-    let pairs = rays.iter().enumerate().flat_map(|(i, a)| rays[i + 1..].iter().map(move |b| (a, b)));
-    pairs.map(|(a, b)| a.cross(*b).length().atan2(a.dot(*b))).fold(0.0, f64::max)
+    let rays: Vec<DVec3> = centres
+        .iter()
+        .map(|c| (point - *c).normalize_or_zero())
+        .collect();
+    let pairs = rays
+        .iter()
+        .enumerate()
+        .flat_map(|(i, a)| rays[i + 1..].iter().map(move |b| (a, b)));
+    pairs
+        .map(|(a, b)| a.cross(*b).length().atan2(a.dot(*b)))
+        .fold(0.0, f64::max)
 }
 
 fn polished(sights: &[Sight<'_>], point: DVec3) -> Option<DVec3> {
@@ -67,13 +77,17 @@ fn polished(sights: &[Sight<'_>], point: DVec3) -> Option<DVec3> {
         let residual = image - sight.pixel;
         let rotation = sight.cam_from_map.rotation_matrix();
         let (fx, fy) = (sight.intrinsics.fx / p.z, sight.intrinsics.fy / p.z);
-        let rows = [DVec3::new(fx, 0.0, -fx * p.x / p.z), DVec3::new(0.0, fy, -fy * p.y / p.z)];
+        let rows = [
+            DVec3::new(fx, 0.0, -fx * p.x / p.z),
+            DVec3::new(0.0, fy, -fy * p.y / p.z),
+        ];
         for (row, r) in rows.into_iter().zip([residual.x, residual.y]) {
             let j = rotation.transpose() * row;
             hessian += DMat3::from_cols(j * j.x, j * j.y, j * j.z);
             gradient += j * r;
         }
     }
-    let damped = hessian + DMat3::IDENTITY * (1e-9 * (hessian.x_axis.x + hessian.y_axis.y + hessian.z_axis.z));
+    let damped = hessian
+        + DMat3::IDENTITY * (1e-9 * (hessian.x_axis.x + hessian.y_axis.y + hessian.z_axis.z));
     (damped.determinant().abs() > 0.0).then(|| point - damped.inverse() * gradient)
 }

@@ -26,20 +26,33 @@ pub struct Motion {
 }
 
 /// Motion between two calibrated pictures; `pairs` are (pixel in first, pixel in second).
-pub fn motion(pairs: &[(DVec2, DVec2)], cameras: [&Intrinsics; 2], max_error_px: f64, seed: u64) -> Option<Motion> {
+pub fn motion(
+    pairs: &[(DVec2, DVec2)],
+    cameras: [&Intrinsics; 2],
+    max_error_px: f64,
+    seed: u64,
+) -> Option<Motion> {
     let ray = |camera: &Intrinsics, pixel: DVec2| camera.ray_in_cam(pixel).truncate();
-    let rays: Vec<(DVec2, DVec2)> = pairs.iter().map(|(a, b)| (ray(cameras[0], *a), ray(cameras[1], *b))).collect();
+    let rays: Vec<(DVec2, DVec2)> = pairs
+        .iter()
+        .map(|(a, b)| (ray(cameras[0], *a), ray(cameras[1], *b)))
+        .collect();
     let focal = 0.25 * (cameras[0].fx + cameras[0].fy + cameras[1].fx + cameras[1].fy);
     let limit = max_error_px / focal;
     let solve = |sample: &[usize]| {
         let first = std::array::from_fn(|i| rays[sample[i]].0.to_array().into());
         let second = std::array::from_fn(|i| rays[sample[i]].1.to_array().into());
         let matrices = kornia_3d::pose::essential_5pt(&first, &second).into_iter();
-        matrices.map(|e| DMat3::from_cols_array(&e.into())).collect()
+        matrices
+            .map(|e| DMat3::from_cols_array(&e.into()))
+            .collect()
     };
     let essential = consensus::<5>(&rays, limit, seed, solve)?;
-    let within =
-        |e: &DMat3| -> Vec<usize> { (0..rays.len()).filter(|&i| sampson(e, rays[i]) <= limit * limit).collect() };
+    let within = |e: &DMat3| -> Vec<usize> {
+        (0..rays.len())
+            .filter(|&i| sampson(e, rays[i]) <= limit * limit)
+            .collect()
+    };
     let mut inliers = within(&essential);
     let picked: Vec<(DVec2, DVec2)> = inliers.iter().map(|&i| rays[i]).collect();
     let mut pose = facing(&essential, &picked)?;
@@ -51,22 +64,36 @@ pub fn motion(pairs: &[(DVec2, DVec2)], cameras: [&Intrinsics; 2], max_error_px:
     inliers.retain(|&i| is_in_front(&pose, rays[i]));
     let mut angles: Vec<f64> = inliers.iter().map(|&i| ray_angle(&pose, rays[i])).collect();
     let parallax_deg = median(&mut angles)?.to_degrees();
-    Some(Motion { second_from_first: pose, inliers, parallax_deg })
+    Some(Motion {
+        second_from_first: pose,
+        inliers,
+        parallax_deg,
+    })
 }
 
 /// Fundamental matrix (`second^T F first = 0`) and the matches that agree with it.
-pub fn fundamental(pairs: &[(DVec2, DVec2)], max_error_px: f64, seed: u64) -> Option<(DMat3, Vec<usize>)> {
+pub fn fundamental(
+    pairs: &[(DVec2, DVec2)],
+    max_error_px: f64,
+    seed: u64,
+) -> Option<(DMat3, Vec<usize>)> {
     let solve = |sample: &[usize]| {
         let picked: Vec<(DVec2, DVec2)> = sample.iter().map(|&i| pairs[i]).collect();
         eight_point(&picked).into_iter().collect()
     };
     let limit = max_error_px * max_error_px;
-    let within = |f: &DMat3| -> Vec<usize> { (0..pairs.len()).filter(|&i| sampson(f, pairs[i]) <= limit).collect() };
+    let within = |f: &DMat3| -> Vec<usize> {
+        (0..pairs.len())
+            .filter(|&i| sampson(f, pairs[i]) <= limit)
+            .collect()
+    };
     let mut matrix = consensus::<8>(pairs, max_error_px, seed, solve)?;
     let mut inliers = within(&matrix);
     for _ in 0..3 {
         let picked: Vec<(DVec2, DVec2)> = inliers.iter().map(|&i| pairs[i]).collect();
-        let Some(better) = eight_point(&picked) else { break };
+        let Some(better) = eight_point(&picked) else {
+            break;
+        };
         let agreeing = within(&better);
         if agreeing.len() < inliers.len() {
             break;
@@ -86,12 +113,23 @@ pub fn homography_share(pairs: &[(DVec2, DVec2)], max_error_px: f64, seed: u64) 
     let mut best = 0;
     for _ in 0..100 {
         let sample: [(DVec2, DVec2); 4] = std::array::from_fn(|_| pairs[rng.random_range(0..n)]);
-        let Some(matrix) = four_point(&sample) else { continue };
+        let Some(matrix) = four_point(&sample) else {
+            continue;
+        };
         let error = |(a, b): &(DVec2, DVec2)| {
             let image = matrix * a.extend(1.0);
-            if image.z.abs() < 1e-12 { f64::INFINITY } else { (image.truncate() / image.z).distance(*b) }
+            if image.z.abs() < 1e-12 {
+                f64::INFINITY
+            } else {
+                (image.truncate() / image.z).distance(*b)
+            }
         };
-        best = best.max(pairs.iter().filter(|pair| error(pair) <= max_error_px).count());
+        best = best.max(
+            pairs
+                .iter()
+                .filter(|pair| error(pair) <= max_error_px)
+                .count(),
+        );
     }
     best as f64 / n as f64
 }
@@ -118,7 +156,9 @@ fn consensus<const N: usize>(
         }
         for matrix in solve(&sample) {
             let bound = best.as_ref().map_or(f64::INFINITY, |b| b.0);
-            let Some(cost) = truncated_cost(data, &matrix, limit * limit, bound) else { continue };
+            let Some(cost) = truncated_cost(data, &matrix, limit * limit, bound) else {
+                continue;
+            };
             best = Some((cost, matrix));
             let share = (1.0 - cost / (n as f64 * limit * limit)).max(0.05);
             let needed = MISS.ln() / (1.0 - share.powi(N as i32)).max(1e-12).ln();
@@ -132,7 +172,10 @@ fn consensus<const N: usize>(
 fn truncated_cost(data: &[(DVec2, DVec2)], matrix: &DMat3, limit: f64, bound: f64) -> Option<f64> {
     let mut cost = 0.0;
     for chunk in data.chunks(32) {
-        cost += chunk.iter().map(|pair| sampson(matrix, *pair).min(limit)).sum::<f64>();
+        cost += chunk
+            .iter()
+            .map(|pair| sampson(matrix, *pair).min(limit))
+            .sum::<f64>();
         if cost >= bound {
             return None;
         }
@@ -146,7 +189,8 @@ fn sampson(matrix: &DMat3, (a, b): (DVec2, DVec2)) -> f64 {
     let line = *matrix * a;
     let back = matrix.transpose() * b;
     let value = b.dot(line);
-    value * value / (line.x * line.x + line.y * line.y + back.x * back.x + back.y * back.y).max(1e-300)
+    value * value
+        / (line.x * line.x + line.y * line.y + back.x * back.x + back.y * back.y).max(1e-300)
 }
 
 fn essential_of(pose: &Rigid) -> DMat3 {
@@ -168,7 +212,10 @@ fn facing(essential: &DMat3, rays: &[(DVec2, DVec2)]) -> Option<Rigid> {
         for sign in [1.0, -1.0] {
             let t = u.column(2) * sign;
             let pose = Rigid::new(rotation, DVec3::new(t[0], t[1], t[2]));
-            let count = rays.iter().filter(|pair| is_in_front(&pose, **pair)).count();
+            let count = rays
+                .iter()
+                .filter(|pair| is_in_front(&pose, **pair))
+                .count();
             if count > most {
                 (best, most) = (Some(pose), count);
             }
@@ -194,7 +241,10 @@ fn is_in_front(pose: &Rigid, (a, b): (DVec2, DVec2)) -> bool {
 
 fn ray_angle(pose: &Rigid, (a, b): (DVec2, DVec2)) -> f64 {
     let first = pose.rotation * a.extend(1.0);
-    first.cross(b.extend(1.0)).length().atan2(first.dot(b.extend(1.0)))
+    first
+        .cross(b.extend(1.0))
+        .length()
+        .atan2(first.dot(b.extend(1.0)))
 }
 
 /// Gauss-Newton on the Sampson distance over rotation and direction of translation, derivatives by differences.
@@ -210,7 +260,10 @@ fn polished(start: &Rigid, rays: &[(DVec2, DVec2)], limit: f64) -> Rigid {
         let moved = |i: usize, by: f64| {
             let turn = [DVec3::X, DVec3::Y, DVec3::Z];
             if i < 3 {
-                return Rigid::new(DQuat::from_scaled_axis(turn[i] * by) * pose.rotation, pose.translation);
+                return Rigid::new(
+                    DQuat::from_scaled_axis(turn[i] * by) * pose.rotation,
+                    pose.translation,
+                );
             }
             let shift = if i == 3 { side } else { up };
             Rigid::new(pose.rotation, (pose.translation + shift * by).normalize())
@@ -227,7 +280,9 @@ fn polished(start: &Rigid, rays: &[(DVec2, DVec2)], limit: f64) -> Rigid {
             gradient += weight * here * row;
         }
         hessian += SMatrix::<f64, 5, 5>::identity() * (1e-6 * hessian.trace());
-        let Some(step) = hessian.cholesky().map(|c| -c.solve(&gradient)) else { break };
+        let Some(step) = hessian.cholesky().map(|c| -c.solve(&gradient)) else {
+            break;
+        };
         let turned = DQuat::from_scaled_axis(DVec3::new(step[0], step[1], step[2])) * pose.rotation;
         let shifted = (pose.translation + side * step[3] + up * step[4]).normalize();
         pose = Rigid::new(turned, shifted).renormalized();
@@ -241,7 +296,11 @@ fn conditioning(points: impl Iterator<Item = DVec2> + Clone) -> DMat3 {
     let mean = points.clone().sum::<DVec2>() / n;
     let spread = points.map(|p| p.distance(mean)).sum::<f64>() / n;
     let scale = std::f64::consts::SQRT_2 / spread.max(1e-12);
-    DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, DVec3::new(-mean.x * scale, -mean.y * scale, 1.0))
+    DMat3::from_cols(
+        DVec3::X * scale,
+        DVec3::Y * scale,
+        DVec3::new(-mean.x * scale, -mean.y * scale, 1.0),
+    )
 }
 
 /// Least squares over all pairs (Hartley 1997); at least eight.
@@ -274,7 +333,12 @@ pub fn eight_point(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
     svd.singular_values[smallest] = 0.0;
     let flat = svd.recompose().ok()?;
     let matrix = second.transpose() * DMat3::from_cols_slice(flat.as_slice()) * first;
-    let length = matrix.to_cols_array().iter().map(|v| v * v).sum::<f64>().sqrt();
+    let length = matrix
+        .to_cols_array()
+        .iter()
+        .map(|v| v * v)
+        .sum::<f64>()
+        .sqrt();
     (length.is_finite() && length > 0.0).then(|| matrix * (1.0 / length))
 }
 
@@ -300,8 +364,11 @@ fn four_point(pairs: &[(DVec2, DVec2); 4]) -> Option<DMat3> {
         }
     }
     let h = system.lu().solve(&right)?;
-    let matrix =
-        DMat3::from_cols(DVec3::new(h[0], h[3], h[6]), DVec3::new(h[1], h[4], h[7]), DVec3::new(h[2], h[5], 1.0));
+    let matrix = DMat3::from_cols(
+        DVec3::new(h[0], h[3], h[6]),
+        DVec3::new(h[1], h[4], h[7]),
+        DVec3::new(h[2], h[5], 1.0),
+    );
     matrix.is_finite().then_some(matrix)
 }
 
@@ -315,55 +382,4 @@ pub fn median(values: &mut [f64]) -> Option<f64> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const CAMERA: Intrinsics = Intrinsics { width_px: 640, height_px: 480, fx: 500.0, fy: 505.0, cx: 321.0, cy: 238.0 };
-
-    /// 200 matches with up to 0.4 px of noise along each axis, every fifth one wrong.
-    fn pairs(pose: &Rigid) -> Vec<(DVec2, DVec2)> {
-        let mut rng = Pcg32::seed_from_u64(8);
-        let mut out = Vec::new();
-        while out.len() < 200 {
-            let mut number = |size: f64| rng.random_range(-size..size);
-            let point = DVec3::new(number(2.0), number(2.0), 5.0 + number(2.0));
-            let Some((a, b)) = CAMERA.project(point).zip(CAMERA.project(pose.transform_point(point))) else { continue };
-            let wrong = if out.len() % 5 == 0 { DVec2::new(number(200.0), number(200.0)) } else { DVec2::ZERO };
-            out.push((a, b + wrong + DVec2::new(number(0.4), number(0.4))));
-        }
-        out
-    }
-
-    #[test]
-    fn the_motion_is_found_among_wrong_matches() {
-        let pose = Rigid::exp(DVec3::new(0.8, 0.1, 0.2), DVec3::new(0.05, -0.15, 0.02));
-        let found = motion(&pairs(&pose), [&CAMERA, &CAMERA], 1.0, 1).unwrap();
-        let along = found.second_from_first.translation.dot(pose.translation.normalize());
-        assert!(found.second_from_first.angle_to(&pose).to_degrees() < 0.15);
-        assert!(along > 0.3_f64.to_radians().cos() - 1e-3, "{along}");
-        assert!(
-            found.inliers.len() >= 150 && found.parallax_deg > 5.0,
-            "{} {}",
-            found.inliers.len(),
-            found.parallax_deg
-        );
-    }
-
-    #[test]
-    fn a_mere_turn_shows_no_parallax_and_fits_a_homography() {
-        let turn = Rigid::exp(DVec3::ZERO, DVec3::new(0.05, -0.15, 0.02));
-        let matches = pairs(&turn);
-        assert!(motion(&matches, [&CAMERA, &CAMERA], 1.0, 1).is_none_or(|m| m.parallax_deg < 0.3));
-        assert!(homography_share(&matches, 1.0, 1) > 0.7);
-        let moved = Rigid::exp(DVec3::new(0.8, 0.1, 0.2), DVec3::ZERO);
-        assert!(homography_share(&pairs(&moved), 1.0, 1) < 0.5);
-    }
-
-    #[test]
-    fn too_few_or_equal_matches_give_nothing() {
-        let same = vec![(DVec2::new(10.0, 20.0), DVec2::new(10.0, 20.0)); 40];
-        assert!(motion(&same[..7], [&CAMERA, &CAMERA], 1.0, 1).is_none());
-        assert!(motion(&same, [&CAMERA, &CAMERA], 1.0, 1).is_none_or(|m| m.parallax_deg < 1e-6));
-        assert!(fundamental(&same[..10], 1.0, 1).is_none());
-    }
-}
+mod tests;

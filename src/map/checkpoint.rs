@@ -81,20 +81,32 @@ pub fn write(checkpoint: &Checkpoint, path: &Path) -> Result<(), CheckpointError
         }
         Ok(())
     })
-    .map_err(|e| CheckpointError::Write { reason: e.to_string(), path: path.to_owned() })
+    .map_err(|e| CheckpointError::Write {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    })
 }
 
 /// Reads and checks a whole file. Sections that this version does not know are checked and left out.
 pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
-    let io_fault = |e: io::Error| CheckpointError::Read { reason: e.to_string(), path: path.to_owned() };
-    let damaged = |reason: String| CheckpointError::Damaged { reason, path: path.to_owned() };
+    let io_fault = |e: io::Error| CheckpointError::Read {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    };
+    let damaged = |reason: String| CheckpointError::Damaged {
+        reason,
+        path: path.to_owned(),
+    };
     let mut file = File::open(path).map_err(io_fault)?;
     let file_info = file.metadata().map_err(io_fault)?;
     if !file_info.is_file() {
         return Err(io_fault(io::Error::other("not a regular file")));
     }
     if file_info.len() < FILE_HEADER_BYTES {
-        return Err(damaged(format!("{} bytes, shorter than its header", file_info.len())));
+        return Err(damaged(format!(
+            "{} bytes, shorter than its header",
+            file_info.len()
+        )));
     }
     let n_sections = read_header(&mut file, path)?;
     let mut remaining_bytes = file_info.len() - FILE_HEADER_BYTES;
@@ -114,7 +126,9 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
         known.map_err(|reason| damaged(format!("section {}: {reason}", tag.escape_ascii())))?;
     }
     if remaining_bytes != 0 {
-        return Err(damaged(format!("{remaining_bytes} bytes behind the last section")));
+        return Err(damaged(format!(
+            "{remaining_bytes} bytes behind the last section"
+        )));
     }
     let missing = |name: &str| damaged(format!("no section {name}"));
     let meta: Meta = meta.ok_or_else(|| missing("META"))?;
@@ -147,19 +161,34 @@ struct Meta {
 /// Checks the file header; returns the number of sections.
 fn read_header(file: &mut File, path: &Path) -> Result<u32, CheckpointError> {
     let mut header = [0; FILE_HEADER_BYTES as usize];
-    file.read_exact(&mut header).map_err(|e| CheckpointError::Read { reason: e.to_string(), path: path.to_owned() })?;
-    let (magic, rest) = header.split_first_chunk::<8>().expect("the header is longer than its magic");
+    file.read_exact(&mut header)
+        .map_err(|e| CheckpointError::Read {
+            reason: e.to_string(),
+            path: path.to_owned(),
+        })?;
+    let (magic, rest) = header
+        .split_first_chunk::<8>()
+        .expect("the header is longer than its magic");
     let word = |ix: usize| u32::from_le_bytes([rest[ix], rest[ix + 1], rest[ix + 2], rest[ix + 3]]);
     let (version, n_sections, crc) = (word(0), word(4), word(8));
     if *magic != MAGIC {
-        return Err(CheckpointError::Magic { found: *magic, path: path.to_owned() });
+        return Err(CheckpointError::Magic {
+            found: *magic,
+            path: path.to_owned(),
+        });
     }
     // The CRC comes first: a flipped bit in the version is damage, not another version.
     if crc != crc32c::crc32c(&header[..16]) || n_sections > MAX_SECTIONS {
-        return Err(CheckpointError::Damaged { reason: "its header fails the CRC".to_owned(), path: path.to_owned() });
+        return Err(CheckpointError::Damaged {
+            reason: "its header fails the CRC".to_owned(),
+            path: path.to_owned(),
+        });
     }
     if version != VERSION {
-        return Err(CheckpointError::Version { found: version, path: path.to_owned() });
+        return Err(CheckpointError::Version {
+            found: version,
+            path: path.to_owned(),
+        });
     }
     Ok(n_sections)
 }
@@ -169,7 +198,9 @@ type Section = ([u8; 4], Vec<u8>);
 /// The outer result is the disk's, the inner one the format's.
 fn read_section(file: &mut File, remaining_bytes: &mut u64) -> io::Result<Result<Section, String>> {
     if *remaining_bytes < SECTION_FRAME_BYTES {
-        return Ok(Err(format!("the file ends, {remaining_bytes} bytes are left")));
+        return Ok(Err(format!(
+            "the file ends, {remaining_bytes} bytes are left"
+        )));
     }
     let mut tag = [0; 4];
     file.read_exact(&mut tag)?;
@@ -178,7 +209,9 @@ fn read_section(file: &mut File, remaining_bytes: &mut u64) -> io::Result<Result
     let n_bytes = u64::from_le_bytes(length);
     *remaining_bytes -= SECTION_FRAME_BYTES;
     if n_bytes > *remaining_bytes {
-        return Ok(Err(format!("{n_bytes} bytes announced, {remaining_bytes} are left")));
+        return Ok(Err(format!(
+            "{n_bytes} bytes announced, {remaining_bytes} are left"
+        )));
     }
     *remaining_bytes -= n_bytes;
     let mut content = vec![0; n_bytes as usize];
@@ -232,14 +265,19 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
         Ok((meta, rest.read_u8()?))
     };
     let (meta, code) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
-    let scale = ScaleSource::from_code(code).ok_or_else(|| format!("scale source {code} is unknown"))?;
+    let scale =
+        ScaleSource::from_code(code).ok_or_else(|| format!("scale source {code} is unknown"))?;
     Ok(Meta { scale, ..meta })
 }
 
 fn keyframe_bytes(poses: &[KeyframePose]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(poses.len() * KEYFRAME_BYTES);
     for pose in poses {
-        let (q, t, k) = (pose.map_from_cam.rotation, pose.map_from_cam.translation, &pose.intrinsics);
+        let (q, t, k) = (
+            pose.map_from_cam.rotation,
+            pose.map_from_cam.translation,
+            &pose.intrinsics,
+        );
         bytes.extend_from_slice(&pose.keyframe_id.to_le_bytes());
         bytes.extend_from_slice(&pose.stamp.nanos.to_le_bytes());
         for number in [q.w, q.x, q.y, q.z, t.x, t.y, t.z] {
@@ -257,14 +295,20 @@ fn keyframe_bytes(poses: &[KeyframePose]) -> Vec<u8> {
 fn parse_keyframes(content: &[u8]) -> Result<Vec<KeyframePose>, String> {
     let (rows, rest) = content.as_chunks::<KEYFRAME_BYTES>();
     if !rest.is_empty() {
-        return Err(format!("{} bytes are no whole number of keyframes of {KEYFRAME_BYTES}", content.len()));
+        return Err(format!(
+            "{} bytes are no whole number of keyframes of {KEYFRAME_BYTES}",
+            content.len()
+        ));
     }
     let mut poses = Vec::with_capacity(rows.len());
     for row in rows {
         let pose = parse_keyframe(row).map_err(|e| e.to_string())?;
         let lengths_fit = (pose.map_from_cam.rotation.length() - 1.0).abs() < 1e-6;
         if !pose.map_from_cam.is_finite() || !lengths_fit || !pose.intrinsics.is_plausible() {
-            return Err(format!("keyframe {} has no usable pose or intrinsics", pose.keyframe_id));
+            return Err(format!(
+                "keyframe {} has no usable pose or intrinsics",
+                pose.keyframe_id
+            ));
         }
         poses.push(pose);
     }
@@ -277,7 +321,10 @@ fn parse_keyframe(mut row: &[u8]) -> io::Result<KeyframePose> {
     let mut numbers = [0.0; 7];
     row.read_f64_into::<LittleEndian>(&mut numbers)?;
     let [w, x, y, z, tx, ty, tz] = numbers;
-    let (width_px, height_px) = (row.read_u32::<LittleEndian>()?, row.read_u32::<LittleEndian>()?);
+    let (width_px, height_px) = (
+        row.read_u32::<LittleEndian>()?,
+        row.read_u32::<LittleEndian>()?,
+    );
     let mut numbers = [0.0; 4];
     row.read_f64_into::<LittleEndian>(&mut numbers)?;
     let [fx, fy, cx, cy] = numbers;
@@ -285,12 +332,20 @@ fn parse_keyframe(mut row: &[u8]) -> io::Result<KeyframePose> {
         keyframe_id,
         stamp,
         map_from_cam: Rigid::new(DQuat::from_xyzw(x, y, z, w), DVec3::new(tx, ty, tz)),
-        intrinsics: Intrinsics { width_px, height_px, fx, fy, cx, cy },
+        intrinsics: Intrinsics {
+            width_px,
+            height_px,
+            fx,
+            fy,
+            cx,
+            cy,
+        },
     })
 }
 
 fn splat_bytes(splats: &Splats) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(4 + splats.len() * layout::bytes_per_splat(splats.sh_degree));
+    let mut bytes =
+        Vec::with_capacity(4 + splats.len() * layout::bytes_per_splat(splats.sh_degree));
     bytes.extend_from_slice(&u32::from(splats.sh_degree).to_le_bytes());
     layout::encode(splats, 0..splats.len(), &mut bytes);
     bytes
@@ -299,9 +354,15 @@ fn splat_bytes(splats: &Splats) -> Vec<u8> {
 fn parse_splats(content: &[u8]) -> Result<Splats, String> {
     let (head, body) = content.split_first_chunk::<4>().ok_or("no SH degree")?;
     let sh_degree = u32::from_le_bytes(*head);
-    let sh_degree = u8::try_from(sh_degree).ok().filter(|degree| *degree <= layout::MAX_SH_DEGREE);
-    let mut splats = Splats { sh_degree: sh_degree.ok_or("its SH degree is above 3")?, ..Splats::default() };
-    layout::decode(body, &mut splats).ok_or_else(|| format!("{} bytes are no whole number of splats", body.len()))?;
+    let sh_degree = u8::try_from(sh_degree)
+        .ok()
+        .filter(|degree| *degree <= layout::MAX_SH_DEGREE);
+    let mut splats = Splats {
+        sh_degree: sh_degree.ok_or("its SH degree is above 3")?,
+        ..Splats::default()
+    };
+    layout::decode(body, &mut splats)
+        .ok_or_else(|| format!("{} bytes are no whole number of splats", body.len()))?;
     match layout::fault(&splats) {
         Some(reason) => Err(reason),
         None => Ok(splats),

@@ -75,16 +75,21 @@ pub fn digest(splats: &Splats) -> [u8; 32] {
 
 /// `digest` as 64 hexadecimal digits, for `report.json`: equal exactly when the maps are equal, bit for bit.
 pub fn map_sha256(splats: &Splats) -> String {
-    digest(splats).iter().fold(String::with_capacity(64), |mut hex, byte| {
-        write!(hex, "{byte:02x}").expect("writing to a string cannot fail");
-        hex
-    })
+    digest(splats)
+        .iter()
+        .fold(String::with_capacity(64), |mut hex, byte| {
+            write!(hex, "{byte:02x}").expect("writing to a string cannot fail");
+            hex
+        })
 }
 
 /// What is wrong with splats that came from outside: array lengths that disagree, numbers that are not finite.
 pub fn fault(splats: &Splats) -> Option<String> {
     if splats.sh_degree > MAX_SH_DEGREE {
-        return Some(format!("SH degree {}, expected 0 to {MAX_SH_DEGREE}", splats.sh_degree));
+        return Some(format!(
+            "SH degree {}, expected 0 to {MAX_SH_DEGREE}",
+            splats.sh_degree
+        ));
     }
     let n = splats.len();
     let lengths = [
@@ -94,8 +99,13 @@ pub fn fault(splats: &Splats) -> Option<String> {
         ("sh", splats.sh.len(), n * splats.sh_stride()),
         ("anchors", splats.anchors.len(), n),
     ];
-    if let Some((name, found, expected)) = lengths.iter().find(|(_, found, expected)| found != expected) {
-        return Some(format!("{name} holds {found} entries for {n} splats, expected {expected}"));
+    if let Some((name, found, expected)) = lengths
+        .iter()
+        .find(|(_, found, expected)| found != expected)
+    {
+        return Some(format!(
+            "{name} holds {found} entries for {n} splats, expected {expected}"
+        ));
     }
     let names = ["means", "log_scales", "quats", "opacity_logits", "sh"];
     for (name, numbers) in names.iter().zip(float_arrays(splats, &(0..n))) {
@@ -104,7 +114,10 @@ pub fn fault(splats: &Splats) -> Option<String> {
             return Some(format!("{name} of splat {splat_ix} is {}", numbers[ix]));
         }
     }
-    let lost = splats.quats.iter().position(|q| q.iter().all(|v| *v == 0.0));
+    let lost = splats
+        .quats
+        .iter()
+        .position(|q| q.iter().all(|v| *v == 0.0));
     lost.map(|splat_ix| format!("quaternion of splat {splat_ix} has no length"))
 }
 
@@ -170,7 +183,12 @@ mod tests {
         let mut bytes = Vec::new();
         encode(&two_splats(), 1..2, &mut bytes);
         let words: Vec<f32> = bytes[..56].chunks(4).map(LittleEndian::read_f32).collect();
-        assert_eq!(words, [4.0, 5.0, 6.0, -2.0, -2.0, -2.0, 0.5, 0.5, 0.5, 0.5, -0.25, 0.4, 0.5, 0.6]);
+        assert_eq!(
+            words,
+            [
+                4.0, 5.0, 6.0, -2.0, -2.0, -2.0, 0.5, 0.5, 0.5, 0.5, -0.25, 0.4, 0.5, 0.6
+            ]
+        );
         assert_eq!(bytes[56..], [9, 0, 0, 0]);
     }
 
@@ -212,7 +230,10 @@ mod tests {
     /// Computed apart from this code, with Python: `hashlib.sha256(struct.pack('<QI28fII', ...))`.
     #[test]
     fn the_hash_is_the_documented_one() {
-        assert_eq!(map_sha256(&two_splats()), "3a696fd9f924736ed34a86a844bb6a9c251bcc9ab35a180389f36b22ec38ca6c");
+        assert_eq!(
+            map_sha256(&two_splats()),
+            "3a696fd9f924736ed34a86a844bb6a9c251bcc9ab35a180389f36b22ec38ca6c"
+        );
     }
 
     #[test]
@@ -222,6 +243,9 @@ mod tests {
         splats.quats[1][3] = f32::NAN;
         assert_eq!(fault(&splats).unwrap(), "quats of splat 1 is NaN");
         splats.anchors.pop();
-        assert_eq!(fault(&splats).unwrap(), "anchors holds 1 entries for 2 splats, expected 2");
+        assert_eq!(
+            fault(&splats).unwrap(),
+            "anchors holds 1 entries for 2 splats, expected 2"
+        );
     }
 }

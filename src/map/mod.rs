@@ -4,17 +4,18 @@
 //! intervals of many steps, and for snapshots.
 
 pub mod align;
+pub mod checkpoint;
+mod growth;
 pub mod keyframes;
+pub mod layout;
 mod revise;
 pub mod schedule;
 pub mod seed;
-pub mod checkpoint;
-pub mod layout;
 pub mod snapshot;
 
 use std::sync::Arc;
 
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use sha2::{Digest, Sha256};
 
@@ -23,7 +24,6 @@ use crate::frame::{Batch, RgbImage};
 use crate::geometry::{GeometryBatch, View};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
-use crate::map::seed::SeedView;
 use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
 use crate::pose::Similarity;
 use crate::splat::{Engine, Rendering, StepSettings, TrainingView};
@@ -343,76 +343,6 @@ impl SplatMap {
         medians.sort_by(f32::total_cmp);
         if let Some(median) = medians.get(medians.len() / 2) {
             self.scene_depth = *median;
-        }
-    }
-
-    /// Looks at one training view, and seeds where the map has a hole or is wrong.
-    fn reseed(&mut self, phase: Phase) {
-        if self.trainable.is_empty() {
-            return;
-        }
-        let view_ix = self.trainable[self.rng.random_range(0..self.trainable.len())];
-        let id = self
-            .keyframes
-            .placed
-            .iter()
-            .find(|(_, p)| p.view_ix == view_ix)
-            .map(|(id, _)| *id);
-        if let Some(id) = id {
-            self.seed_from(id, phase != Phase::Streaming, None);
-        }
-    }
-
-    fn seed_from(&mut self, keyframe_id: u32, fills_gaps: bool, progress: Option<f64>) {
-        let Some(placed) = self
-            .keyframes
-            .placed
-            .get(&keyframe_id)
-            .filter(|p| !p.is_held_out)
-        else {
-            return;
-        };
-        // While the end is known to be far, part of the cap is kept for what is still to be seen.
-        let share = progress.map_or(1.0, |p| (0.25 + p).min(1.0));
-        let cap = (self.params.max_splats as f64 * share) as usize;
-        let room = cap.saturating_sub(self.engine.n_splats());
-        if room == 0 {
-            return;
-        }
-        let cam_from_map = self.engine.poses()[placed.view_ix];
-        let rendering = (self.engine.n_splats() > 0)
-            .then(|| self.engine.render(&placed.intrinsics, &cam_from_map, 0));
-        let view = SeedView {
-            keyframe_id,
-            image: &placed.image,
-            intrinsics: &placed.intrinsics,
-            map_from_cam: &cam_from_map.inverse(),
-            depth: &placed.depth,
-            rendering: rendering.as_ref(),
-            fills_gaps,
-        };
-        let mut seeds = seed::seed(
-            &view,
-            self.params.seeds_per_keyframe,
-            self.params.sh_degree,
-            &mut self.rng,
-        );
-        seeds.truncate(room);
-        if !seeds.is_empty() {
-            self.engine.append(&seeds);
-        }
-    }
-
-    /// Removes splats that have become transparent or lost their numbers.
-    fn prune(&mut self) {
-        let splats = self.engine.splats();
-        let min_opacity = self.params.min_opacity.clamp(1e-6, 1.0 - 1e-6);
-        let min_logit = (min_opacity / (1.0 - min_opacity)).ln();
-        let keep: Vec<bool> = (0..splats.len())
-            .map(|i| splats.is_finite(i) && splats.opacity_logits[i] > min_logit)
-            .collect();
-        if keep.iter().any(|k| !k) {
-            self.engine.retain(&keep);
         }
     }
 

@@ -82,7 +82,8 @@ pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rn
             .transform_point(view.intrinsics.ray_in_cam(pixel) * f64::from(depth));
         let scale = SIGMA_OF_SPACING * spacing_px * f64::from(depth)
             / view.intrinsics.fx.max(view.intrinsics.fy);
-        if !mean.is_finite() || !(scale > 0.0 && scale.is_finite()) {
+        let is_usable = mean.is_finite() && scale > 0.0 && scale.is_finite();
+        if !is_usable {
             continue;
         }
         splats.means.push(mean.as_vec3().to_array());

@@ -27,7 +27,9 @@ impl ScaleSource {
     }
 
     pub fn from_code(code: u8) -> Option<Self> {
-        [Self::UpToScale, Self::Given].into_iter().find(|source| source.code() == code)
+        [Self::UpToScale, Self::Given]
+            .into_iter()
+            .find(|source| source.code() == code)
     }
 }
 

@@ -18,14 +18,12 @@ use crate::geometry::GeometryModel;
 use crate::geometry::known::Known;
 use crate::geometry::sfm::Sfm;
 use crate::map::SplatMap;
-use crate::node::pipeline::Subscriber;
 use crate::map::snapshot::{ScaleSource, Snapshot};
+use crate::node::pipeline::Subscriber;
 use crate::pose::Rigid;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
 use crate::splat::cpu::CpuEngine;
-
-
 
 /// How often a lingering node looks for Ctrl-C.
 const LINGER_TICK: Duration = Duration::from_millis(50);
@@ -105,15 +103,27 @@ pub struct Outcome {
 
 impl std::fmt::Debug for Outcome {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Outcome({} of {} keyframes, {:?})", self.snapshot.poses.len(), self.n_selected, self.error)
+        write!(
+            f,
+            "Outcome({} of {} keyframes, {:?})",
+            self.snapshot.poses.len(),
+            self.n_selected,
+            self.error
+        )
     }
 }
 
 /// The geometry model that the parameters name, and where its lengths come from.
 fn model(params: &Params) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
     match params.geometry.as_str() {
-        "sfm" => Ok((Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)), ScaleSource::UpToScale)),
-        "known" => Ok((Box::new(Known::new(params.known.clone(), params.seed)), ScaleSource::Given)),
+        "sfm" => Ok((
+            Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)),
+            ScaleSource::UpToScale,
+        )),
+        "known" => Ok((
+            Box::new(Known::new(params.known.clone(), params.seed)),
+            ScaleSource::Given,
+        )),
         name if name.starts_with("onnx:") => {
             bail!("this build has no ONNX Runtime; use --geometry sfm: {name}")
         }
@@ -130,12 +140,14 @@ pub fn engine(backend: Backend) -> anyhow::Result<Box<dyn Engine>> {
 }
 
 /// Runs a closure on a named thread (at most 15 bytes, as Linux shows them).
-#[expect(clippy::disallowed_types, reason = "the one home of threads")]
 fn spawn<T: Send + 'static>(
     name: &'static str,
     body: impl FnOnce() -> T + Send + 'static,
 ) -> anyhow::Result<std::thread::JoinHandle<T>> {
-    std::thread::Builder::new().name(name.to_owned()).spawn(body).with_context(|| format!("cannot start thread {name}"))
+    std::thread::Builder::new()
+        .name(name.to_owned())
+        .spawn(body)
+        .with_context(|| format!("cannot start thread {name}"))
 }
 
 /// The publisher that the parameters ask for.
@@ -178,7 +190,9 @@ pub fn subscriber(params: &PublishParams) -> anyhow::Result<Option<Box<dyn Subsc
 
 /// Keeps the publisher up for late subscribers, then closes it; Ctrl-C cuts the wait short.
 pub fn linger(outcome: &mut Outcome, secs: f64, stop: &Stop) {
-    let Some(subscriber) = outcome.subscriber.take() else { return };
+    let Some(subscriber) = outcome.subscriber.take() else {
+        return;
+    };
     let watch = Stopwatch::start();
     while watch.secs() < secs && !stop.is_asked() {
         std::thread::sleep(LINGER_TICK);

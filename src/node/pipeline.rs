@@ -36,7 +36,12 @@ pub fn run(
     let watch = Stopwatch::start();
     let (model, scale) = model(&job.params)?;
     let n_frames = job.source.len_hint().filter(|n| *n > 0);
-    let map = SplatMap::new(job.params.map.clone(), job.params.seed, scale, engine(job.params.backend)?);
+    let map = SplatMap::new(
+        job.params.map.clone(),
+        job.params.seed,
+        scale,
+        engine(job.params.backend)?,
+    );
     let stages = Stages {
         map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
         select: SelectStage::new(&job.params),
@@ -93,7 +98,9 @@ impl Stages {
         };
         let mut result = Ok(());
         while result.is_ok() {
-            let Some(frame) = self.source.next() else { break };
+            let Some(frame) = self.source.next() else {
+                break;
+            };
             result = select.push(frame).map_or(Ok(()), &mut map_batch);
         }
         if result.is_ok() {
@@ -119,8 +126,16 @@ impl Stages {
     }
 
     /// A thread per stage.
-    fn on_threads(self, is_live: bool, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
-        let when_full = if is_live { WhenFull::DropOldest } else { WhenFull::Wait };
+    fn on_threads(
+        self,
+        is_live: bool,
+        on_progress: &mut dyn FnMut(Progress),
+    ) -> anyhow::Result<End> {
+        let when_full = if is_live {
+            WhenFull::DropOldest
+        } else {
+            WhenFull::Wait
+        };
         let (frames_tx, frames) = queue("frames", FRAME_QUEUE, when_full);
         let (batches_tx, batches) = queue("batches", 1, WhenFull::Wait);
         let (answers_tx, answers) = queue("answers", 1, WhenFull::Wait);
@@ -128,8 +143,12 @@ impl Stages {
         let (progress_tx, progress) = queue("progress", 1, WhenFull::DropOldest);
 
         let source = spawn("source", move || run_source(self.source, &frames_tx))?;
-        let select = spawn("select", move || run_select(self.select, &frames, &batches_tx))?;
-        let geometry = spawn("geometry", move || run_geometry(self.geometry, &batches, &answers_tx))?;
+        let select = spawn("select", move || {
+            run_select(self.select, &frames, &batches_tx)
+        })?;
+        let geometry = spawn("geometry", move || {
+            run_geometry(self.geometry, &batches, &answers_tx)
+        })?;
         let map = spawn("map", move || {
             let mut publish = |snapshot, progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
@@ -138,7 +157,9 @@ impl Stages {
             };
             run_map(self.map, is_live, &answers, &mut publish)
         })?;
-        let publisher = spawn("publish", move || run_publisher(self.subscriber, &snapshots))?;
+        let publisher = spawn("publish", move || {
+            run_publisher(self.subscriber, &snapshots)
+        })?;
 
         while let Some(progress) = progress.recv() {
             on_progress(progress);
@@ -196,7 +217,11 @@ fn run_source(mut stage: SourceStage, frames: &Sender<Frame>) -> (SourceStage, u
     (stage, frames.dropped())
 }
 
-fn run_select(mut stage: SelectStage, frames: &Receiver<Frame>, batches: &Sender<Arc<Batch>>) -> SelectStage {
+fn run_select(
+    mut stage: SelectStage,
+    frames: &Receiver<Frame>,
+    batches: &Sender<Arc<Batch>>,
+) -> SelectStage {
     while let Some(frame) = frames.recv() {
         if let Some(batch) = stage.push(frame)
             && batches.send(Arc::new(batch)).is_err()
@@ -251,7 +276,9 @@ fn run_map(
         } else {
             answers.recv()
         };
-        let Some((batch, geometry)) = answer else { break };
+        let Some((batch, geometry)) = answer else {
+            break;
+        };
         stage.add(batch.as_deref(), geometry, publish);
     }
     let snapshot = stage.finish(publish);

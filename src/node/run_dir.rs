@@ -17,9 +17,11 @@ use crate::clock::Stamp;
 use crate::config::Settings;
 use crate::eval::comparisons::Comparison;
 use crate::eval::html::{ReportInputs, write_html};
-use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib};
-use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::eval::image_metrics;
+use crate::eval::report::{
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib,
+};
+use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
 use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::layout::map_sha256;
@@ -38,13 +40,19 @@ pub fn prepare(out: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(out)
         .and_then(|()| fs::write(&probe, b"x"))
         .and_then(|()| fs::remove_file(&probe))
-        .with_context(|| format!("cannot write the run directory; name another with --out: {}", out.display()))
+        .with_context(|| {
+            format!(
+                "cannot write the run directory; name another with --out: {}",
+                out.display()
+            )
+        })
 }
 
 /// Log lines go to `run.log` and to stderr; a terminal with a progress bar gets warnings only.
 pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
     let filter = |level: &str| {
-        EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("warn,splat_mapper={level}")))
+        EnvFilter::try_from_default_env()
+            .unwrap_or_else(|_| EnvFilter::new(format!("warn,splat_mapper={level}")))
     };
     let stderr = log_format::layer()
         .with_writer(std::io::stderr)
@@ -55,13 +63,21 @@ pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
         None => None,
         Some(out) => {
             let path = out.join("run.log");
-            let file = fs::File::create(&path).with_context(|| format!("cannot write the log: {}", path.display()))?;
-            let layer = log_format::layer().with_writer(Mutex::new(file)).with_ansi(false).with_target(false);
+            let file = fs::File::create(&path)
+                .with_context(|| format!("cannot write the log: {}", path.display()))?;
+            let layer = log_format::layer()
+                .with_writer(Mutex::new(file))
+                .with_ansi(false)
+                .with_target(false);
             Some(layer.with_filter(filter("info")))
         }
     };
     // A second start in one process (tests) keeps the first log.
-    tracing_subscriber::registry().with(stderr).with(file).try_init().ok();
+    tracing_subscriber::registry()
+        .with(stderr)
+        .with(file)
+        .try_init()
+        .ok();
     Ok(())
 }
 
@@ -94,7 +110,14 @@ fn write(
     let snapshot = &outcome.snapshot;
     let keyframes = timed_keyframes(snapshot);
     let frames = interpolate(&keyframes, &outcome.frame_stamps);
-    let truth: Vec<TimedPose> = outcome.truth.iter().map(|(stamp, pose)| TimedPose { stamp: *stamp, pose: *pose }).collect();
+    let truth: Vec<TimedPose> = outcome
+        .truth
+        .iter()
+        .map(|(stamp, pose)| TimedPose {
+            stamp: *stamp,
+            pose: *pose,
+        })
+        .collect();
     let page = ReportInputs {
         title: input,
         report,
@@ -105,8 +128,11 @@ fn write(
         trajectory: &frames,
         reference: &truth,
     };
-    let checkpoint =
-        Checkpoint { snapshot: (**snapshot).clone(), seed: report.seed, steps: outcome.map.n_steps() };
+    let checkpoint = Checkpoint {
+        snapshot: (**snapshot).clone(),
+        seed: report.seed,
+        steps: outcome.map.n_steps(),
+    };
     let results: [anyhow::Result<()>; 6] = [
         write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
         write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
@@ -120,8 +146,10 @@ fn write(
 
 fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
     let snapshot = &outcome.snapshot;
-    let parameters: BTreeMap<String, serde_json::Value> =
-        settings.entries().map(|(key, value)| (key.to_owned(), value.clone())).collect();
+    let parameters: BTreeMap<String, serde_json::Value> = settings
+        .entries()
+        .map(|(key, value)| (key.to_owned(), value.clone()))
+        .collect();
     let optimise = outcome.secs.optimise;
     let steps = outcome.map.n_steps();
     Report {
@@ -135,7 +163,10 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
         splats: snapshot.splats.len() as u64,
         steps,
         adapter: outcome.map.adapter(),
-        seed: parameters.get("seed").and_then(serde_json::Value::as_u64).unwrap_or_default(),
+        seed: parameters
+            .get("seed")
+            .and_then(serde_json::Value::as_u64)
+            .unwrap_or_default(),
         map_sha256: map_sha256(&snapshot.splats),
         timing_s: Timing {
             wall: outcome.secs.wall,
@@ -144,7 +175,10 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             optimise,
         },
         steps_per_s: (steps > 0 && optimise > 0.0).then(|| steps as f64 / optimise),
-        latency_ms: Latency::of(&outcome.keyframe_to_pose_secs, &outcome.keyframe_to_snapshot_secs),
+        latency_ms: Latency::of(
+            &outcome.keyframe_to_pose_secs,
+            &outcome.keyframe_to_snapshot_secs,
+        ),
         peak_rss_mib: peak_rss_mib(),
         peak_gpu_mib: None,
         quality,
@@ -160,8 +194,12 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
 fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<Comparison>) {
     let ids = outcome.map.keyframe_ids();
     let (held_out, train): (Vec<u32>, Vec<u32>) = {
-        let (held_out, train): (Vec<_>, Vec<_>) = ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
-        (held_out.into_iter().map(|k| k.0).collect(), train.into_iter().map(|k| k.0).collect())
+        let (held_out, train): (Vec<_>, Vec<_>) =
+            ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
+        (
+            held_out.into_iter().map(|k| k.0).collect(),
+            train.into_iter().map(|k| k.0).collect(),
+        )
     };
     let stride = train.len().div_ceil(MAX_TRAIN_VIEWS).max(1);
     let train: Vec<u32> = train.into_iter().step_by(stride).collect();
@@ -170,12 +208,20 @@ fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<C
         let picture_stride = ids.len().div_ceil(max_pictures).max(1);
         let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
         for (i, id) in ids.iter().enumerate() {
-            let Some((rendering, photo)) = outcome.map.render_keyframe(*id) else { continue };
+            let Some((rendering, photo)) = outcome.map.render_keyframe(*id) else {
+                continue;
+            };
             let psnr = image_metrics::psnr(&rendering.rgb, &photo);
             psnrs.push(psnr);
             ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
             if i % picture_stride == 0 {
-                pictures.push(Comparison { keyframe_id: *id, held_out: is_held_out, photo, rendering, psnr });
+                pictures.push(Comparison {
+                    keyframe_id: *id,
+                    held_out: is_held_out,
+                    photo,
+                    rendering,
+                    psnr,
+                });
             }
         }
         (mean(&psnrs), mean(&ssims))
@@ -197,7 +243,10 @@ fn mean(values: &[f64]) -> Option<f64> {
 }
 
 fn timed_keyframes(snapshot: &Arc<Snapshot>) -> Vec<TimedPose> {
-    let timed = |pose: &crate::map::snapshot::KeyframePose| TimedPose { stamp: pose.stamp, pose: pose.map_from_cam };
+    let timed = |pose: &crate::map::snapshot::KeyframePose| TimedPose {
+        stamp: pose.stamp,
+        pose: pose.map_from_cam,
+    };
     snapshot.poses.iter().map(timed).collect()
 }
 
@@ -214,15 +263,34 @@ fn interpolate(keyframes: &[TimedPose], stamps: &[Stamp]) -> Vec<TimedPose> {
         let share = stamp.secs_since(last.stamp) / next.stamp.secs_since(last.stamp);
         Some(last.pose.between(&next.pose, share))
     };
-    stamps.iter().filter_map(|stamp| Some(TimedPose { stamp: *stamp, pose: pose_at(*stamp)? })).collect()
+    stamps
+        .iter()
+        .filter_map(|stamp| {
+            Some(TimedPose {
+                stamp: *stamp,
+                pose: pose_at(*stamp)?,
+            })
+        })
+        .collect()
 }
 
 fn summary(report: &Report, out: Option<&Path>) -> String {
     let keyframes = &report.keyframes;
-    let quality = report.quality.psnr_holdout.map(|psnr| format!(", {psnr:.2} dB on held-out views")).unwrap_or_default();
-    let place = out.map(|out| format!(": {}", out.join("report.html").display())).unwrap_or_default();
+    let quality = report
+        .quality
+        .psnr_holdout
+        .map(|psnr| format!(", {psnr:.2} dB on held-out views"))
+        .unwrap_or_default();
+    let place = out
+        .map(|out| format!(": {}", out.join("report.html").display()))
+        .unwrap_or_default();
     format!(
         "{} of {} keyframes in {} component(s), {} splats, {} steps in {:.0} s{quality}{place}",
-        keyframes.registered, keyframes.selected, keyframes.components, report.splats, report.steps, report.timing_s.wall
+        keyframes.registered,
+        keyframes.selected,
+        keyframes.components,
+        report.splats,
+        report.steps,
+        report.timing_s.wall
     )
 }

@@ -64,7 +64,11 @@ pub(super) struct MapStage {
 
 impl SourceStage {
     pub(super) fn new(source: Box<dyn Source>, stop: Stop) -> Self {
-        Self { source, stop, decode_secs: 0.0 }
+        Self {
+            source,
+            stop,
+            decode_secs: 0.0,
+        }
     }
 
     pub(super) fn next(&mut self) -> Option<Frame> {
@@ -112,7 +116,11 @@ impl SelectStage {
 
 impl GeometryStage {
     pub(super) fn new(model: Box<dyn GeometryModel>) -> Self {
-        Self { model, secs: 0.0, note: None }
+        Self {
+            model,
+            secs: 0.0,
+            note: None,
+        }
     }
 
     pub(super) fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
@@ -139,7 +147,11 @@ impl GeometryStage {
                 geometry.batch_id,
                 geometry.views.len(),
                 geometry.revised.len(),
-                geometry.note.as_ref().map(|n| format!(", {n}")).unwrap_or_default()
+                geometry
+                    .note
+                    .as_ref()
+                    .map(|n| format!(", {n}"))
+                    .unwrap_or_default()
             );
             self.note = geometry.note.clone().or(self.note.take());
         }
@@ -148,7 +160,13 @@ impl GeometryStage {
 }
 
 impl MapStage {
-    pub(super) fn new(map: SplatMap, params: &Params, is_live: bool, stop: Stop, n_frames: Option<u64>) -> Self {
+    pub(super) fn new(
+        map: SplatMap,
+        params: &Params,
+        is_live: bool,
+        stop: Stop,
+        n_frames: Option<u64>,
+    ) -> Self {
         Self {
             map,
             params: params.map.clone(),
@@ -171,8 +189,13 @@ impl MapStage {
         geometry: GeometryBatch,
         publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
     ) {
-        let newest = batch.and_then(|b| b.keyframes.last()).map(|k| k.frame.seq + 1);
-        let progress = self.n_frames.zip(newest).map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
+        let newest = batch
+            .and_then(|b| b.keyframes.last())
+            .map(|k| k.frame.seq + 1);
+        let progress = self
+            .n_frames
+            .zip(newest)
+            .map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
         for keyframe in batch.iter().flat_map(|b| &b.keyframes) {
             self.n_keyframes = self.n_keyframes.max(keyframe.id as usize + 1);
             if !self.map.has_keyframe(keyframe.id) {
@@ -193,7 +216,10 @@ impl MapStage {
     }
 
     /// Live: a few steps, if any are left to make. Returns whether some were made.
-    pub(super) fn step_while_waiting(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) -> bool {
+    pub(super) fn step_while_waiting(
+        &mut self,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) -> bool {
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.keyframe_ids().len() as u64;
         let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
@@ -202,7 +228,10 @@ impl MapStage {
     }
 
     /// The steps after the last keyframe, the poses of held-out views, and the last snapshot.
-    pub(super) fn finish(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) -> Arc<Snapshot> {
+    pub(super) fn finish(
+        &mut self,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) -> Arc<Snapshot> {
         let watch = Stopwatch::start();
         let (first, last) = (self.map.n_steps(), self.params.steps);
         while !self.stop.is_asked() && self.map.n_steps() < last {

@@ -90,7 +90,13 @@ enum Outcome {
 impl Assembler {
     /// `max_bytes` bounds all incomplete snapshots together; a map larger than that never completes.
     pub fn new(max_bytes: usize) -> Self {
-        Self { max_bytes, open: Vec::new(), newest: None, n_seen: 0, counts: Counts::default() }
+        Self {
+            max_bytes,
+            open: Vec::new(),
+            newest: None,
+            n_seen: 0,
+            counts: Counts::default(),
+        }
     }
 
     pub fn counts(&self) -> Counts {
@@ -113,7 +119,11 @@ impl Assembler {
     }
 
     pub fn add_chunk(&mut self, chunk: SplatChunk) -> Option<Snapshot> {
-        let identity = Identity { map_id: chunk.map_id, epoch: chunk.epoch, revision: chunk.revision };
+        let identity = Identity {
+            map_id: chunk.map_id,
+            epoch: chunk.epoch,
+            revision: chunk.revision,
+        };
         let shape = Shape {
             map_sha256: chunk.map_sha256,
             n_splats: chunk.n_splats,
@@ -128,21 +138,38 @@ impl Assembler {
             && chunk.chunk_ix < shape.n_chunks
             && chunk.first_splat < shape.n_splats
             && crc32c::crc32c(&chunk.data) == chunk.crc32c;
-        self.add(&identity, is_sound.then_some(n_bytes + KEEP_BYTES), |open| {
-            if !open.takes(&shape) {
-                return Outcome::Rejected;
-            }
-            if open.pieces.contains_key(&chunk.chunk_ix) {
-                return Outcome::Superfluous;
-            }
-            open.pieces.insert(chunk.chunk_ix, Piece { first_splat: chunk.first_splat, data: chunk.data });
-            Outcome::Used
-        })
+        self.add(
+            &identity,
+            is_sound.then_some(n_bytes + KEEP_BYTES),
+            |open| {
+                if !open.takes(&shape) {
+                    return Outcome::Rejected;
+                }
+                if open.pieces.contains_key(&chunk.chunk_ix) {
+                    return Outcome::Superfluous;
+                }
+                open.pieces.insert(
+                    chunk.chunk_ix,
+                    Piece {
+                        first_splat: chunk.first_splat,
+                        data: chunk.data,
+                    },
+                );
+                Outcome::Used
+            },
+        )
     }
 
-    #[expect(clippy::needless_pass_by_value, reason = "like its two sisters it takes what was received")]
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "like its two sisters it takes what was received"
+    )]
     pub fn add_manifest(&mut self, manifest: SplatManifest) -> Option<Snapshot> {
-        let identity = Identity { map_id: manifest.map_id, epoch: manifest.epoch, revision: manifest.revision };
+        let identity = Identity {
+            map_id: manifest.map_id,
+            epoch: manifest.epoch,
+            revision: manifest.revision,
+        };
         let shape = Shape {
             map_sha256: manifest.map_sha256,
             n_splats: manifest.n_splats,
@@ -153,28 +180,44 @@ impl Assembler {
         let is_sound = shape.sh_degree <= layout::MAX_SH_DEGREE
             && shape.n_chunks <= shape.n_splats
             && (shape.n_chunks == 0) == (shape.n_splats == 0);
-        self.add(&identity, (is_sound && scale.is_some()).then_some(KEEP_BYTES), |open| {
-            if !open.takes(&shape) {
-                return Outcome::Rejected;
-            }
-            if open.manifest.is_some() {
-                return Outcome::Superfluous;
-            }
-            open.manifest = scale.map(|scale| (manifest.n_keyframes, scale, manifest.header.stamp.into()));
-            Outcome::Used
-        })
+        self.add(
+            &identity,
+            (is_sound && scale.is_some()).then_some(KEEP_BYTES),
+            |open| {
+                if !open.takes(&shape) {
+                    return Outcome::Rejected;
+                }
+                if open.manifest.is_some() {
+                    return Outcome::Superfluous;
+                }
+                open.manifest =
+                    scale.map(|scale| (manifest.n_keyframes, scale, manifest.header.stamp.into()));
+                Outcome::Used
+            },
+        )
     }
 
-    #[expect(clippy::needless_pass_by_value, reason = "like its two sisters it takes what was received")]
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "like its two sisters it takes what was received"
+    )]
     pub fn add_keyframes(&mut self, array: KeyframeArray) -> Option<Snapshot> {
-        let identity = Identity { map_id: array.map_id, epoch: array.epoch, revision: array.revision };
-        let poses: Option<Vec<KeyframePose>> = array.keyframes.iter().map(|pose| pose.to_pose()).collect();
-        let n_bytes = poses.as_ref().map(|poses| size_of_val(&poses[..]) + KEEP_BYTES);
+        let identity = Identity {
+            map_id: array.map_id,
+            epoch: array.epoch,
+            revision: array.revision,
+        };
+        let poses: Option<Vec<KeyframePose>> =
+            array.keyframes.iter().map(|pose| pose.to_pose()).collect();
+        let n_bytes = poses
+            .as_ref()
+            .map(|poses| size_of_val(&poses[..]) + KEEP_BYTES);
         self.add(&identity, n_bytes, |open| {
             if open.keyframes.contains_key(&array.first_ix) {
                 return Outcome::Superfluous;
             }
-            open.keyframes.insert(array.first_ix, poses.unwrap_or_default());
+            open.keyframes
+                .insert(array.first_ix, poses.unwrap_or_default());
             Outcome::Used
         })
     }
@@ -270,8 +313,9 @@ impl Assembler {
             return None;
         };
         self.newest = Some(identity);
-        let (kept, stale): (Vec<Open>, Vec<Open>) =
-            std::mem::take(&mut self.open).into_iter().partition(|open| self.is_newer(&open.identity));
+        let (kept, stale): (Vec<Open>, Vec<Open>) = std::mem::take(&mut self.open)
+            .into_iter()
+            .partition(|open| self.is_newer(&open.identity));
         self.counts.abandoned += stale.iter().map(|open| open.n_messages).sum::<u64>();
         self.open = kept;
         Some(snapshot)
@@ -297,16 +341,23 @@ impl Open {
     }
 
     fn has_all(&self) -> bool {
-        let (Some(shape), Some((n_keyframes, ..))) = (&self.shape, &self.manifest) else { return false };
+        let (Some(shape), Some((n_keyframes, ..))) = (&self.shape, &self.manifest) else {
+            return false;
+        };
         let n_poses: usize = self.keyframes.values().map(Vec::len).sum();
-        self.pieces.len() == shape.n_chunks as usize && n_poses >= *n_keyframes as usize && !self.keyframes.is_empty()
+        self.pieces.len() == shape.n_chunks as usize
+            && n_poses >= *n_keyframes as usize
+            && !self.keyframes.is_empty()
     }
 
     /// `None` when ranges leave holes, the hash differs or a number is not finite.
     fn into_snapshot(self) -> Option<Snapshot> {
         let shape = self.shape?;
         let (n_keyframes, scale, stamp) = self.manifest?;
-        let mut splats = Splats { sh_degree: shape.sh_degree, ..Splats::default() };
+        let mut splats = Splats {
+            sh_degree: shape.sh_degree,
+            ..Splats::default()
+        };
         for piece in self.pieces.values() {
             if piece.first_splat as usize != splats.len() {
                 return None;

@@ -12,14 +12,22 @@ pub mod type_hash;
 pub mod wire;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
+#[cfg(feature = "zenoh")]
+mod zenoh_session;
 
 #[derive(Debug, thiserror::Error)]
 pub enum PublishError {
     #[error("parameter publish.{name} = {found:?} is of no use, expected {expected}")]
-    Param { name: &'static str, found: String, expected: String },
+    Param {
+        name: &'static str,
+        found: String,
+        expected: String,
+    },
     #[error("parameter publish.zenoh_config: {reason}: {}", path.display())]
     Config { reason: String, path: PathBuf },
-    #[error("cannot open zenoh on {endpoints}: {reason}; check publish.zenoh_listen and publish.zenoh_connect")]
+    #[error(
+        "cannot open zenoh on {endpoints}: {reason}; check publish.zenoh_listen and publish.zenoh_connect"
+    )]
     Open { endpoints: String, reason: String },
     #[error("cannot declare {key:?} on zenoh: {reason}")]
     Declare { key: String, reason: String },
@@ -27,6 +35,8 @@ pub enum PublishError {
     Send { key: String, reason: String },
     #[error(transparent)]
     Encode(#[from] CdrError),
-    #[error("zenoh did not close within {waited_secs} s, most likely over a stalled peer; its threads are left behind")]
+    #[error(
+        "zenoh did not close within {waited_secs} s, most likely over a stalled peer; its threads are left behind"
+    )]
     Close { waited_secs: f64 },
 }

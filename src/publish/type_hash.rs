@@ -32,20 +32,25 @@ const PLAIN_TYPES: [(&str, u32); 14] = [
 const ARRAY_OFFSET: u32 = 48;
 const UNBOUNDED_SEQUENCE_OFFSET: u32 = 144;
 
-const SECTION_BREAK: &str = "================================================================================\n";
+const SECTION_BREAK: &str =
+    "================================================================================\n";
 
 /// `RIHS01_` and 64 hexadecimal digits.
 pub fn type_hash<T: Message>() -> String {
     let json = description_json(T::TYPE_NAME, T::DEFINITION);
-    Sha256::digest(json.as_bytes()).iter().fold("RIHS01_".to_owned(), |mut text, byte| {
-        write!(text, "{byte:02x}").expect("writing to a string cannot fail");
-        text
-    })
+    Sha256::digest(json.as_bytes())
+        .iter()
+        .fold("RIHS01_".to_owned(), |mut text, byte| {
+            write!(text, "{byte:02x}").expect("writing to a string cannot fail");
+            text
+        })
 }
 
 /// `geometry_msgs/msg/PoseStamped` -> `geometry_msgs::msg::dds_::PoseStamped_`, as keys spell types.
 pub fn dds_type_name<T: Message>() -> String {
-    let (package, name) = T::TYPE_NAME.split_once("/msg/").expect("a type name is package/msg/Name");
+    let (package, name) = T::TYPE_NAME
+        .split_once("/msg/")
+        .expect("a type name is package/msg/Name");
     format!("{package}::msg::dds_::{name}_")
 }
 
@@ -55,12 +60,17 @@ fn description_json(type_name: &str, definition: &str) -> String {
     let root = sections.next().expect("split yields one part");
     let types: BTreeMap<String, &str> = sections
         .map(|section| {
-            let section = section.strip_prefix("MSG: ").expect("a section begins with MSG:");
+            let section = section
+                .strip_prefix("MSG: ")
+                .expect("a section begins with MSG:");
             let (name, body) = section.split_once('\n').expect("a section has a body");
             (full_name(name, ""), body)
         })
         .collect();
-    let referenced: Vec<String> = types.iter().map(|(name, body)| type_json(name, body, &types)).collect();
+    let referenced: Vec<String> = types
+        .iter()
+        .map(|(name, body)| type_json(name, body, &types))
+        .collect();
     format!(
         "{{\"type_description\": {}, \"referenced_type_descriptions\": [{}]}}",
         type_json(type_name, root, &types),
@@ -74,32 +84,51 @@ fn type_json(type_name: &str, body: &str, types: &BTreeMap<String, &str>) -> Str
     for line in body.lines() {
         let text = line.split('#').next().unwrap_or_default();
         let mut words = text.split_ascii_whitespace();
-        let (Some(type_text), Some(name)) = (words.next(), words.next()) else { continue };
+        let (Some(type_text), Some(name)) = (words.next(), words.next()) else {
+            continue;
+        };
         // A constant, not a field.
         if text.contains('=') {
             continue;
         }
-        fields.push(format!("{{\"name\": \"{name}\", \"type\": {}}}", field_type_json(type_text, package, types)));
+        fields.push(format!(
+            "{{\"name\": \"{name}\", \"type\": {}}}",
+            field_type_json(type_text, package, types)
+        ));
     }
-    format!("{{\"type_name\": \"{type_name}\", \"fields\": [{}]}}", fields.join(", "))
+    format!(
+        "{{\"type_name\": \"{type_name}\", \"fields\": [{}]}}",
+        fields.join(", ")
+    )
 }
 
 fn field_type_json(type_text: &str, package: &str, types: &BTreeMap<String, &str>) -> String {
     let (element, brackets) = match type_text.split_once('[') {
-        Some((element, rest)) => (element, Some(rest.strip_suffix(']').expect("an array type ends with ]"))),
+        Some((element, rest)) => (
+            element,
+            Some(rest.strip_suffix(']').expect("an array type ends with ]")),
+        ),
         None => (type_text, None),
     };
     let (offset, capacity) = match brackets {
         None => (0, 0),
         Some("") => (UNBOUNDED_SEQUENCE_OFFSET, 0),
-        Some(count) => (ARRAY_OFFSET, count.parse::<u32>().expect("bounded sequences are not in use here")),
+        Some(count) => (
+            ARRAY_OFFSET,
+            count
+                .parse::<u32>()
+                .expect("bounded sequences are not in use here"),
+        ),
     };
     let plain = PLAIN_TYPES.iter().find(|(name, _)| *name == element);
     let (id, nested) = match plain {
         Some((_, id)) => (*id, String::new()),
         None => (NESTED_TYPE, full_name(element, package)),
     };
-    assert!(nested.is_empty() || types.contains_key(&nested), "definition of {nested} is missing");
+    assert!(
+        nested.is_empty() || types.contains_key(&nested),
+        "definition of {nested} is missing"
+    );
     format!(
         "{{\"type_id\": {}, \"capacity\": {capacity}, \"string_capacity\": 0, \"nested_type_name\": \"{nested}\"}}",
         id + offset

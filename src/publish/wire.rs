@@ -88,12 +88,16 @@ macro_rules! keyframe_pose_body {
 
 impl Message for SplatChunk {
     const TYPE_NAME: &'static str = "splat_mapper_msgs/msg/SplatChunk";
-    const DEFINITION: &'static str = concat!(include_str!("../../msgs/msg/SplatChunk.msg"), header_def!());
+    const DEFINITION: &'static str =
+        concat!(include_str!("../../msgs/msg/SplatChunk.msg"), header_def!());
 }
 
 impl Message for SplatManifest {
     const TYPE_NAME: &'static str = "splat_mapper_msgs/msg/SplatManifest";
-    const DEFINITION: &'static str = concat!(include_str!("../../msgs/msg/SplatManifest.msg"), header_def!());
+    const DEFINITION: &'static str = concat!(
+        include_str!("../../msgs/msg/SplatManifest.msg"),
+        header_def!()
+    );
 }
 
 impl Message for KeyframePoseMsg {
@@ -129,7 +133,8 @@ impl<'a> Messages<'a> {
         Self {
             snapshot,
             map_sha256: layout::digest(&snapshot.splats),
-            splats_per_chunk: (chunk_bytes / layout::bytes_per_splat(snapshot.splats.sh_degree)).max(1),
+            splats_per_chunk: (chunk_bytes / layout::bytes_per_splat(snapshot.splats.sh_degree))
+                .max(1),
             keyframes_per_array: (chunk_bytes / KEYFRAME_POSE_BYTES).max(1),
         }
     }
@@ -137,8 +142,14 @@ impl<'a> Messages<'a> {
     /// The newest refined pose; `None` before the first keyframe is placed.
     pub fn pose(&self) -> Option<PoseStamped> {
         let newest = self.snapshot.poses.last()?;
-        let header = Header { stamp: newest.stamp.into(), frame_id: MAP_FRAME.to_owned() };
-        Some(PoseStamped { header, pose: newest.map_from_cam.into() })
+        let header = Header {
+            stamp: newest.stamp.into(),
+            frame_id: MAP_FRAME.to_owned(),
+        };
+        Some(PoseStamped {
+            header,
+            pose: newest.map_from_cam.into(),
+        })
     }
 
     pub fn manifest(&self) -> SplatManifest {
@@ -160,18 +171,21 @@ impl<'a> Messages<'a> {
     /// At least one, so that a client learns of a map without keyframes.
     pub fn keyframes(&self) -> impl Iterator<Item = KeyframeArray> {
         let n_keyframes = self.snapshot.poses.len();
-        (0..n_keyframes.max(1)).step_by(self.keyframes_per_array).map(move |first| KeyframeArray {
-            header: self.header(),
-            map_id: self.snapshot.map_id,
-            epoch: self.snapshot.epoch,
-            revision: self.snapshot.revision,
-            n_keyframes: n_keyframes as u32,
-            first_ix: first as u32,
-            keyframes: self.snapshot.poses[first..n_keyframes.min(first + self.keyframes_per_array)]
-                .iter()
-                .map(KeyframePoseMsg::from)
-                .collect(),
-        })
+        (0..n_keyframes.max(1))
+            .step_by(self.keyframes_per_array)
+            .map(move |first| KeyframeArray {
+                header: self.header(),
+                map_id: self.snapshot.map_id,
+                epoch: self.snapshot.epoch,
+                revision: self.snapshot.revision,
+                n_keyframes: n_keyframes as u32,
+                first_ix: first as u32,
+                keyframes: self.snapshot.poses
+                    [first..n_keyframes.min(first + self.keyframes_per_array)]
+                    .iter()
+                    .map(KeyframePoseMsg::from)
+                    .collect(),
+            })
     }
 
     pub fn chunks(&self) -> impl Iterator<Item = SplatChunk> {
@@ -208,7 +222,10 @@ impl<'a> Messages<'a> {
     }
 
     fn header(&self) -> Header {
-        Header { stamp: self.snapshot.stamp.into(), frame_id: MAP_FRAME.to_owned() }
+        Header {
+            stamp: self.snapshot.stamp.into(),
+            frame_id: MAP_FRAME.to_owned(),
+        }
     }
 }
 
@@ -261,6 +278,11 @@ impl KeyframePoseMsg {
 /// A message as it travels; the bound on its size is ours to keep.
 pub fn payload<T: Message + Serialize>(message: &T) -> Result<Vec<u8>, CdrError> {
     let payload = ros::encode(message)?;
-    assert!(payload.len() <= MAX_MESSAGE_BYTES, "{} of {} bytes", T::TYPE_NAME, payload.len());
+    assert!(
+        payload.len() <= MAX_MESSAGE_BYTES,
+        "{} of {} bytes",
+        T::TYPE_NAME,
+        payload.len()
+    );
     Ok(payload)
 }

@@ -3,7 +3,6 @@
 //! Four topics under `<domain>/<namespace>/`: `pose`, `keyframes`, `splats`, `splats/manifest`. Late joiners `get`
 //! the same keys and receive the newest snapshot. Blocking calls; the caller brings the thread.
 
-use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -15,23 +14,20 @@ use zenoh::bytes::ZBytes;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
-use zenoh::{Config, Session, Wait};
+use zenoh::{Session, Wait};
 
 use crate::config::PublishParams;
 use crate::map::snapshot::Snapshot;
 use crate::publish::PublishError;
 use crate::publish::type_hash::{dds_type_name, type_hash};
 use crate::publish::wire::{self, KeyframeArray, Messages, SplatChunk, SplatManifest};
+use crate::publish::zenoh_session::open_session;
 use crate::ros::{Message, PoseStamped};
 
-/// A peer that takes in nothing for so long while we wait is cut off; it may connect again.
-const MAX_BLOCKED: Duration = Duration::from_secs(2);
 /// `close` waits no longer. zenoh itself lingers ten seconds over bytes that a stalled peer never takes.
 const MAX_CLOSING: Duration = Duration::from_secs(2);
 /// Questions of late joiners that may wait; more are dropped, and their askers see an empty answer.
 const MAX_QUESTIONS: usize = 32;
-/// Another program may take a port between our looking for it and zenoh's opening it.
-const OPEN_ATTEMPTS: usize = 3;
 
 /// The topics in the order of `Topics`.
 const POSE: usize = 0;
@@ -63,10 +59,17 @@ struct Topic {
 }
 
 impl Topic {
-    fn outgoing<T: Message + Serialize>(&mut self, message: &T, stamp_nanos: i64) -> Result<Outgoing, PublishError> {
+    fn outgoing<T: Message + Serialize>(
+        &mut self,
+        message: &T,
+        stamp_nanos: i64,
+    ) -> Result<Outgoing, PublishError> {
         self.sequence += 1;
         let attachment = attachment(self.sequence, stamp_nanos, self.gid);
-        Ok(Outgoing { payload: ZBytes::from(wire::payload(message)?), attachment: ZBytes::from(attachment) })
+        Ok(Outgoing {
+            payload: ZBytes::from(wire::payload(message)?),
+            attachment: ZBytes::from(attachment),
+        })
     }
 }
 
@@ -83,7 +86,9 @@ pub struct ZenohPublisher {
 
 impl std::fmt::Debug for ZenohPublisher {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("ZenohPublisher").field("endpoints", &self.endpoints).finish_non_exhaustive()
+        f.debug_struct("ZenohPublisher")
+            .field("endpoints", &self.endpoints)
+            .finish_non_exhaustive()
     }
 }
 
@@ -97,9 +102,24 @@ impl ZenohPublisher {
         let topics = [
             names.declare::<PoseStamped>(&session, POSE, CongestionControl::Drop, &questions_tx)?,
             // A snapshot without its keyframes is incomplete: they travel like chunks.
-            names.declare::<KeyframeArray>(&session, KEYFRAMES, CongestionControl::Block, &questions_tx)?,
-            names.declare::<SplatChunk>(&session, SPLATS, CongestionControl::Block, &questions_tx)?,
-            names.declare::<SplatManifest>(&session, MANIFEST, CongestionControl::Block, &questions_tx)?,
+            names.declare::<KeyframeArray>(
+                &session,
+                KEYFRAMES,
+                CongestionControl::Block,
+                &questions_tx,
+            )?,
+            names.declare::<SplatChunk>(
+                &session,
+                SPLATS,
+                CongestionControl::Block,
+                &questions_tx,
+            )?,
+            names.declare::<SplatManifest>(
+                &session,
+                MANIFEST,
+                CongestionControl::Block,
+                &questions_tx,
+            )?,
         ];
         let node_token = declare_token(&session, names.node_token(&session))?;
         let keys = topics.each_ref().map(|topic| topic.key.clone());
@@ -107,8 +127,19 @@ impl ZenohPublisher {
         let answers = std::thread::Builder::new()
             .name("zenoh-answers".to_owned())
             .spawn(move || answer(&questions, &keys, &shared))
-            .map_err(|e| PublishError::Open { endpoints: endpoints.join(" "), reason: e.to_string() })?;
-        Ok(Self { session, topics, node_token, latest, answers, endpoints, chunk_bytes: params.chunk_bytes })
+            .map_err(|e| PublishError::Open {
+                endpoints: endpoints.join(" "),
+                reason: e.to_string(),
+            })?;
+        Ok(Self {
+            session,
+            topics,
+            node_token,
+            latest,
+            answers,
+            endpoints,
+            chunk_bytes: params.chunk_bytes,
+        })
     }
 
     /// Where peers may connect, for example `tcp/127.0.0.1:40123`; port 0 of the parameter is resolved.
@@ -130,7 +161,10 @@ impl ZenohPublisher {
                     .congestion_control(topic.congestion_control)
                     .attachment(outgoing.attachment.clone())
                     .wait()
-                    .map_err(|e| PublishError::Send { key: topic.key.clone(), reason: e.to_string() })?;
+                    .map_err(|e| PublishError::Send {
+                        key: topic.key.clone(),
+                        reason: e.to_string(),
+                    })?;
             }
         }
         Ok(())
@@ -146,8 +180,14 @@ impl ZenohPublisher {
                 .map(|message| pose.outgoing(&message, stamp_nanos))
                 .into_iter()
                 .collect::<Result<_, _>>()?,
-            messages.keyframes().map(|message| keyframes.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
-            messages.chunks().map(|message| splats.outgoing(&message, stamp_nanos)).collect::<Result<_, _>>()?,
+            messages
+                .keyframes()
+                .map(|message| keyframes.outgoing(&message, stamp_nanos))
+                .collect::<Result<_, _>>()?,
+            messages
+                .chunks()
+                .map(|message| splats.outgoing(&message, stamp_nanos))
+                .collect::<Result<_, _>>()?,
             vec![manifest.outgoing(&messages.manifest(), stamp_nanos)?],
         ])
     }
@@ -155,27 +195,41 @@ impl ZenohPublisher {
     /// Says goodbye to peers. Waits at most two seconds; what still hangs then is left to its threads.
     pub fn close(self) -> Result<(), PublishError> {
         let (done_tx, done) = sync_channel(1);
-        let Self { session, topics, node_token, answers, .. } = self;
-        let closing = std::thread::Builder::new().name("zenoh-close".to_owned()).spawn(move || {
-            for topic in topics {
-                undeclare(topic.token);
-                // Drops the sender of questions; with the last one `answers` ends.
-                if let Err(e) = topic.queryable.undeclare().wait() {
-                    tracing::debug!("zenoh queryable {:?} did not undeclare: {e}", topic.key);
+        let Self {
+            session,
+            topics,
+            node_token,
+            answers,
+            ..
+        } = self;
+        let closing = std::thread::Builder::new()
+            .name("zenoh-close".to_owned())
+            .spawn(move || {
+                for topic in topics {
+                    undeclare(topic.token);
+                    // Drops the sender of questions; with the last one `answers` ends.
+                    if let Err(e) = topic.queryable.undeclare().wait() {
+                        tracing::debug!("zenoh queryable {:?} did not undeclare: {e}", topic.key);
+                    }
                 }
-            }
-            undeclare(node_token);
-            if let Err(e) = session.close().wait() {
-                tracing::debug!("zenoh session did not close: {e}");
-            }
-            if answers.join().is_err() {
-                tracing::warn!("the thread that answers late joiners panicked");
-            }
-            // Nobody waits any more when this fails.
-            done_tx.send(()).unwrap_or(());
-        });
+                undeclare(node_token);
+                if let Err(e) = session.close().wait() {
+                    tracing::debug!("zenoh session did not close: {e}");
+                }
+                if answers.join().is_err() {
+                    tracing::warn!("the thread that answers late joiners panicked");
+                }
+                // Nobody waits any more when this fails.
+                done_tx.send(()).unwrap_or(());
+            });
         let is_done = closing.is_ok() && done.recv_timeout(MAX_CLOSING).is_ok();
-        if is_done { Ok(()) } else { Err(PublishError::Close { waited_secs: MAX_CLOSING.as_secs_f64() }) }
+        if is_done {
+            Ok(())
+        } else {
+            Err(PublishError::Close {
+                waited_secs: MAX_CLOSING.as_secs_f64(),
+            })
+        }
     }
 }
 
@@ -202,11 +256,20 @@ impl Names {
                 expected: "letters, digits and underscores, parts joined by /".to_owned(),
             });
         }
-        Ok(Self { domain_id: params.domain_id, namespace })
+        Ok(Self {
+            domain_id: params.domain_id,
+            namespace,
+        })
     }
 
     fn key<T: Message>(&self, topic: &str) -> String {
-        format!("{}/{}/{topic}/{}/{}", self.domain_id, self.namespace, dds_type_name::<T>(), type_hash::<T>())
+        format!(
+            "{}/{}/{topic}/{}/{}",
+            self.domain_id,
+            self.namespace,
+            dds_type_name::<T>(),
+            type_hash::<T>()
+        )
     }
 
     /// The node is the last part of the namespace, the rest is the node's namespace; `%` stands for `/`.
@@ -218,7 +281,12 @@ impl Names {
     }
 
     fn node_token(&self, session: &Session) -> String {
-        format!("@ros2_lv/{}/{}/0/0/NN/{}", self.domain_id, session.zid(), self.node())
+        format!(
+            "@ros2_lv/{}/{}/0/0/NN/{}",
+            self.domain_id,
+            session.zid(),
+            self.node()
+        )
     }
 
     /// `::,10:,:,:,,` stands for reliable, volatile, the last ten.
@@ -250,19 +318,34 @@ impl Names {
             .declare_queryable(&key)
             .callback(move |query| match questions.try_send((topic_ix, query)) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
-                Err(TrySendError::Full(_)) => tracing::debug!("a late joiner was turned away: {MAX_QUESTIONS} wait"),
+                Err(TrySendError::Full(_)) => {
+                    tracing::debug!("a late joiner was turned away: {MAX_QUESTIONS} wait");
+                }
             })
             .wait()
-            .map_err(|e| PublishError::Declare { key: key.clone(), reason: e.to_string() })?;
+            .map_err(|e| PublishError::Declare {
+                key: key.clone(),
+                reason: e.to_string(),
+            })?;
         let token = declare_token(session, token_key)?;
         let gid = *gid.first_chunk().expect("SHA-256 is longer than a gid");
-        Ok(Topic { key, gid, sequence: 0, congestion_control, queryable, token })
+        Ok(Topic {
+            key,
+            gid,
+            sequence: 0,
+            congestion_control,
+            queryable,
+            token,
+        })
     }
 }
 
 fn declare_token(session: &Session, key: String) -> Result<LivelinessToken, PublishError> {
     let token = session.liveliness().declare_token(key.clone()).wait();
-    token.map_err(|e| PublishError::Declare { key, reason: e.to_string() })
+    token.map_err(|e| PublishError::Declare {
+        key,
+        reason: e.to_string(),
+    })
 }
 
 fn undeclare(token: LivelinessToken) {
@@ -294,92 +377,4 @@ fn attachment(sequence: i64, stamp_nanos: i64, gid: [u8; 16]) -> Vec<u8> {
     bytes.push(gid.len() as u8);
     bytes.extend_from_slice(&gid);
     bytes
-}
-
-/// Returns the session and the endpoints that it listens on.
-fn open_session(params: &PublishParams) -> Result<(Session, Vec<String>), PublishError> {
-    if !params.zenoh_config.is_empty() {
-        let (config, endpoints) = config_from_file(Path::new(&params.zenoh_config))?;
-        let session = zenoh::open(config).wait();
-        let session =
-            session.map_err(|e| PublishError::Open { endpoints: endpoints.join(" "), reason: e.to_string() })?;
-        return Ok((session, endpoints));
-    }
-    let mut attempts = 0;
-    loop {
-        attempts += 1;
-        let endpoint = resolve_port(&params.zenoh_listen)?;
-        match zenoh::open(config_from_params(params, &endpoint)?).wait() {
-            Ok(session) => return Ok((session, Vec::from_iter((!endpoint.is_empty()).then_some(endpoint)))),
-            Err(e) if attempts == OPEN_ATTEMPTS || endpoint == params.zenoh_listen => {
-                return Err(PublishError::Open { endpoints: endpoint, reason: e.to_string() });
-            }
-            Err(_) => {}
-        }
-    }
-}
-
-fn config_from_file(path: &Path) -> Result<(Config, Vec<String>), PublishError> {
-    let fault = |reason: String| PublishError::Config { reason, path: path.to_owned() };
-    let config = Config::from_file(path).map_err(|e| fault(e.to_string()))?;
-    // Endpoints may stand per mode or nested; all texts that look like one are one.
-    let listed = config.get_json("listen/endpoints").map_err(|e| fault(e.to_string()))?;
-    let tree: serde_json::Value = serde_json::from_str(&listed).map_err(|e| fault(e.to_string()))?;
-    let mut endpoints = Vec::new();
-    collect_texts(&tree, &mut endpoints);
-    endpoints.retain(|text| text.contains('/'));
-    Ok((config, endpoints))
-}
-
-fn collect_texts(tree: &serde_json::Value, texts: &mut Vec<String>) {
-    match tree {
-        serde_json::Value::String(text) => texts.push(text.clone()),
-        serde_json::Value::Array(items) => items.iter().for_each(|item| collect_texts(item, texts)),
-        serde_json::Value::Object(entries) => entries.values().for_each(|entry| collect_texts(entry, texts)),
-        _ => {}
-    }
-}
-
-fn config_from_params(params: &PublishParams, listen: &str) -> Result<Config, PublishError> {
-    let mut config = Config::default();
-    let list = |endpoint: &str| {
-        let endpoints: Vec<&str> = Some(endpoint).filter(|text| !text.is_empty()).into_iter().collect();
-        serde_json::json!(endpoints).to_string()
-    };
-    let blocked_micros = MAX_BLOCKED.as_micros().to_string();
-    let multicast = params.scouting.to_string();
-    let settings = [
-        ("zenoh_listen", &params.zenoh_listen, "listen/endpoints", list(listen)),
-        ("zenoh_connect", &params.zenoh_connect, "connect/endpoints", list(&params.zenoh_connect)),
-        ("scouting", &multicast, "scouting/multicast/enabled", multicast.clone()),
-        // Compiled out today; a build of zenoh that has it would put maps into /dev/shm.
-        ("zenoh", &multicast, "transport/shared_memory/enabled", "false".to_owned()),
-        (
-            "zenoh",
-            &blocked_micros,
-            "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            blocked_micros.clone(),
-        ),
-    ];
-    for (name, value, key, json) in settings {
-        config.insert_json5(key, &json).map_err(|e| PublishError::Param {
-            name,
-            found: value.clone(),
-            expected: format!("an endpoint such as tcp/127.0.0.1:7447, or nothing ({e})"),
-        })?;
-    }
-    Ok(config)
-}
-
-/// zenoh's stable interface does not tell which port 0 became, so a free one is found first.
-fn resolve_port(endpoint: &str) -> Result<String, PublishError> {
-    let fault = |e: std::io::Error| PublishError::Open { endpoints: endpoint.to_owned(), reason: e.to_string() };
-    let Some((protocol, address)) = endpoint.split_once('/') else { return Ok(endpoint.to_owned()) };
-    let Some(host) = address.strip_suffix(":0") else { return Ok(endpoint.to_owned()) };
-    let bound = match protocol {
-        "tcp" => std::net::TcpListener::bind((host.trim_matches(['[', ']']), 0)).and_then(|l| l.local_addr()),
-        "udp" => std::net::UdpSocket::bind((host.trim_matches(['[', ']']), 0)).and_then(|s| s.local_addr()),
-        _ => return Ok(endpoint.to_owned()),
-    };
-    Ok(format!("{protocol}/{host}:{}", bound.map_err(fault)?.port()))
 }

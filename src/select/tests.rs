@@ -3,6 +3,7 @@
 use super::*;
 use crate::clock::Stamp;
 use crate::config::Settings;
+use crate::frame::RgbImage;
 
 fn params() -> SelectParams {
     Settings::shipped().params().unwrap().select
@@ -132,12 +133,26 @@ fn batches_overlap_and_the_last_one_is_short() {
 #[test]
 fn depth_shows_as_parallax_but_a_turn_does_not() {
     let grid = (0..100).map(|i| [10.0 * (i % 10) as f32, 10.0 * (i / 10) as f32]);
-    let turned = |p: [f32; 2]| [0.98 * p[0] - 0.17 * p[1] + 5.0, 0.17 * p[0] + 0.98 * p[1] - 3.0];
+    let turned = |p: [f32; 2]| {
+        [
+            0.98 * p[0] - 0.17 * p[1] + 5.0,
+            0.17 * p[0] + 0.98 * p[1] - 3.0,
+        ]
+    };
     let turn: Vec<_> = grid.clone().map(|p| (p, turned(p))).collect();
     assert!(parallax_flow(&turn) < 1e-3);
     // A third of the tracks lies nearer and moves 6 px further.
-    let near = |i: usize, p: [f32; 2]| if i % 3 == 0 { [p[0] + 6.0, p[1]] } else { p };
-    let deep: Vec<_> = grid.enumerate().map(|(i, p)| (p, near(i, turned(p)))).collect();
+    let near = |i: usize, p: [f32; 2]| {
+        if i.is_multiple_of(3) {
+            [p[0] + 6.0, p[1]]
+        } else {
+            p
+        }
+    };
+    let deep: Vec<_> = grid
+        .enumerate()
+        .map(|(i, p)| (p, near(i, turned(p))))
+        .collect();
     assert!((5.0..7.0).contains(&parallax_flow(&deep)));
     assert_eq!(parallax_flow(&[]), 0.0);
 }

@@ -37,8 +37,12 @@ pub(crate) fn random_splats(n: usize, sh_degree: u8, seed: u64) -> Splats {
     let mut dice = Dice(seed + 1);
     let sh_stride = 3 * (usize::from(sh_degree) + 1).pow(2);
     Splats {
-        means: (0..n).map(|_| [0; 3].map(|_| 10.0 * dice.number())).collect(),
-        log_scales: (0..n).map(|_| [0; 3].map(|_| dice.number() - 4.0)).collect(),
+        means: (0..n)
+            .map(|_| [0; 3].map(|_| 10.0 * dice.number()))
+            .collect(),
+        log_scales: (0..n)
+            .map(|_| [0; 3].map(|_| dice.number() - 4.0))
+            .collect(),
         quats: (0..n).map(|_| [0; 4].map(|_| dice.number())).collect(),
         opacity_logits: (0..n).map(|_| 5.0 * dice.number()).collect(),
         sh: (0..n * sh_stride).map(|_| dice.number()).collect(),
@@ -47,7 +51,12 @@ pub(crate) fn random_splats(n: usize, sh_degree: u8, seed: u64) -> Splats {
     }
 }
 
-pub(crate) fn random_snapshot(n_splats: usize, n_keyframes: usize, sh_degree: u8, revision: u32) -> Snapshot {
+pub(crate) fn random_snapshot(
+    n_splats: usize,
+    n_keyframes: usize,
+    sh_degree: u8,
+    revision: u32,
+) -> Snapshot {
     let mut dice = Dice(u64::from(revision) + 77);
     let mut number = move || f64::from(dice.number());
     let poses = (0..n_keyframes).map(|ix| KeyframePose {
@@ -79,7 +88,11 @@ pub(crate) fn random_snapshot(n_splats: usize, n_keyframes: usize, sh_degree: u8
 }
 
 fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
-    Checkpoint { snapshot: random_snapshot(n_splats, 5, sh_degree, 9), seed: 11, steps: 3000 }
+    Checkpoint {
+        snapshot: random_snapshot(n_splats, 5, sh_degree, 9),
+        seed: 11,
+        steps: 3000,
+    }
 }
 
 fn read_bytes(folder: &Path, bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
@@ -96,7 +109,10 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         let written = checkpoint(n_splats, sh_degree);
         checkpoint::write(&written, &path).unwrap();
         let back = checkpoint::read(&path).unwrap();
-        assert!(back.snapshot == written.snapshot, "{n_splats} splats of degree {sh_degree}");
+        assert!(
+            back.snapshot == written.snapshot,
+            "{n_splats} splats of degree {sh_degree}"
+        );
         assert_eq!((back.seed, back.steps), (11, 3000));
     }
 }
@@ -120,8 +136,13 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {
         // Without the map itself, which fills screens when this fails.
-        let fault = read_bytes(folder.path(), &bytes[..cut]).map(|_| "half a map was read").unwrap_err();
-        assert!(matches!(fault, CheckpointError::Damaged { .. }), "cut at {cut}: {fault}");
+        let fault = read_bytes(folder.path(), &bytes[..cut])
+            .map(|_| "half a map was read")
+            .unwrap_err();
+        assert!(
+            matches!(fault, CheckpointError::Damaged { .. }),
+            "cut at {cut}: {fault}"
+        );
     }
     assert!(read_bytes(folder.path(), &[&bytes[..], &[0]].concat()).is_err());
 }
@@ -171,7 +192,9 @@ fn a_checkpoint_of_a_later_version_says_so() {
     bytes.extend(crc32c::crc32c(&bytes).to_le_bytes());
     let fault = read_bytes(folder.path(), &bytes).unwrap_err().to_string();
     assert!(fault.contains("version 2"), "{fault}");
-    let fault = read_bytes(folder.path(), b"ply\nformat binary_little_endian 1.0\n").unwrap_err().to_string();
+    let fault = read_bytes(folder.path(), b"ply\nformat binary_little_endian 1.0\n")
+        .unwrap_err()
+        .to_string();
     assert!(fault.contains("no .splatmap"), "{fault}");
 }
 
@@ -185,7 +208,12 @@ fn a_section_of_the_future_is_skipped() {
     bytes[12] += 1;
     let crc = crc32c::crc32c(&bytes[..16]).to_le_bytes();
     bytes[16..20].copy_from_slice(&crc);
-    let section = [b"NEXT".to_vec(), 3_u64.to_le_bytes().to_vec(), b"abc".to_vec()].concat();
+    let section = [
+        b"NEXT".to_vec(),
+        3_u64.to_le_bytes().to_vec(),
+        b"abc".to_vec(),
+    ]
+    .concat();
     bytes.extend(&section);
     bytes.extend(crc32c::crc32c(&section).to_le_bytes());
     assert!(read_bytes(folder.path(), &bytes).unwrap().snapshot == written.snapshot);
@@ -241,12 +269,14 @@ fn a_ply_has_the_header_and_row_that_viewers_expect() {
         property float opacity\nproperty float scale_0\nproperty float scale_1\nproperty float scale_2\n\
         property float rot_0\nproperty float rot_1\nproperty float rot_2\nproperty float rot_3\nend_header\n";
     assert_eq!(std::str::from_utf8(&bytes[..header.len()]).unwrap(), header);
-    let row: Vec<f32> =
-        bytes[header.len()..].chunks(4).map(|word| f32::from_le_bytes(word.try_into().unwrap())).collect();
+    let row: Vec<f32> = bytes[header.len()..]
+        .chunks(4)
+        .map(|word| f32::from_le_bytes(word.try_into().unwrap()))
+        .collect();
     // Red of the three coefficients, then green, then blue.
     let expected = [
-        100.0, 101.0, 102.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 6.0, 9.0, 4.0, 7.0, 10.0, 5.0, 8.0, 11.0, 7.5, -1.0,
-        -2.0, -3.0, 0.5, 0.25, 0.125, 0.0625,
+        100.0, 101.0, 102.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 6.0, 9.0, 4.0, 7.0, 10.0, 5.0, 8.0,
+        11.0, 7.5, -1.0, -2.0, -3.0, 0.5, 0.25, 0.125, 0.0625,
     ];
     assert_eq!(row, expected);
 }
@@ -256,8 +286,12 @@ fn a_ply_of_another_program_reads_with_its_own_order_and_extras() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("other.ply");
     let names = "rot_0 rot_1 rot_2 rot_3 confidence opacity scale_2 scale_1 scale_0 f_dc_2 f_dc_1 f_dc_0 z y x";
-    let mut text = "ply\r\ncomment made elsewhere\nformat binary_little_endian 1.0\nelement vertex 2\n".to_owned();
-    names.split(' ').for_each(|name| text.push_str(&format!("property float32 {name}\n")));
+    let mut text =
+        "ply\r\ncomment made elsewhere\nformat binary_little_endian 1.0\nelement vertex 2\n"
+            .to_owned();
+    names
+        .split(' ')
+        .for_each(|name| text.push_str(&format!("property float32 {name}\n")));
     text.push_str("element face 0\nproperty list uchar int vertex_indices\nend_header\n");
     let mut bytes = text.into_bytes();
     (0..30).for_each(|ix| bytes.extend((ix as f32).to_le_bytes()));
@@ -266,7 +300,10 @@ fn a_ply_of_another_program_reads_with_its_own_order_and_extras() {
     assert_eq!(splats.means, [[14.0, 13.0, 12.0], [29.0, 28.0, 27.0]]);
     assert_eq!(splats.log_scales[1], [23.0, 22.0, 21.0]);
     assert_eq!(splats.quats[1], [15.0, 16.0, 17.0, 18.0]);
-    assert_eq!((splats.opacity_logits[0], &splats.sh[..3]), (5.0, &[11.0, 10.0, 9.0][..]));
+    assert_eq!(
+        (splats.opacity_logits[0], &splats.sh[..3]),
+        (5.0, &[11.0, 10.0, 9.0][..])
+    );
 }
 
 #[test]
@@ -282,21 +319,49 @@ fn a_hostile_ply_is_an_error_that_says_why() {
         let fault = ply::read(&path).unwrap_err().to_string();
         assert!(fault.contains(says), "{says:?} is not in: {fault}");
     };
-    let with_header = |from: &str, to: &str| [header.replace(from, to).as_bytes(), &good[header_end..]].concat();
+    let with_header =
+        |from: &str, to: &str| [header.replace(from, to).as_bytes(), &good[header_end..]].concat();
     check(b"", "end_header");
     check(b"glTF....", "end_header");
     check(b"solid cube\n", "begins with");
     check(&vec![b'a'; 1 << 20], "first 65536 bytes");
-    check(&[b"ply\n".to_vec(), vec![b'\n'; 1 << 20]].concat(), "first 65536 bytes");
+    check(
+        &[b"ply\n".to_vec(), vec![b'\n'; 1 << 20]].concat(),
+        "first 65536 bytes",
+    );
     check(&with_header("vertex 4", "vertex 5"), "promises 5 vertices");
-    check(&with_header("vertex 4", "vertex 18446744073709551615"), "promises");
-    check(&with_header("vertex 4", "vertex 18446744073709551616"), "counts nothing");
+    check(
+        &with_header("vertex 4", "vertex 18446744073709551615"),
+        "promises",
+    );
+    check(
+        &with_header("vertex 4", "vertex 18446744073709551616"),
+        "counts nothing",
+    );
     check(&with_header("vertex 4", "vertex -4"), "counts nothing");
-    check(&with_header("binary_little_endian", "ascii"), "binary_little_endian");
-    check(&with_header("float opacity", "double opacity"), "not of type float");
-    check(&with_header("float rot_3", "float rot_4"), "no property rot_3");
-    check(&with_header("property float x\n", "property float x\nproperty float f_rest_0\n"), "expected 0, 9, 24 or 45");
-    check(&with_header("element vertex", "element face 3\nelement vertex"), "before the vertices");
+    check(
+        &with_header("binary_little_endian", "ascii"),
+        "binary_little_endian",
+    );
+    check(
+        &with_header("float opacity", "double opacity"),
+        "not of type float",
+    );
+    check(
+        &with_header("float rot_3", "float rot_4"),
+        "no property rot_3",
+    );
+    check(
+        &with_header(
+            "property float x\n",
+            "property float x\nproperty float f_rest_0\n",
+        ),
+        "expected 0, 9, 24 or 45",
+    );
+    check(
+        &with_header("element vertex", "element face 3\nelement vertex"),
+        "before the vertices",
+    );
     check(&good[..good.len() - 1], "promises 4 vertices");
     let mut nan = good.clone();
     nan[header_end..header_end + 4].copy_from_slice(&f32::NAN.to_le_bytes());

@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 /// Modules in layer order, as `lib.rs` lists them.
 fn layers() -> Vec<String> {
     let lib = fs::read_to_string("src/lib.rs").unwrap();
-    let names = lib.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+    let names = lib
+        .lines()
+        .filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
     names.map(str::to_owned).collect()
 }
 
@@ -27,41 +29,72 @@ fn rust_files(folder: &Path) -> Vec<PathBuf> {
 
 /// Code without comments.
 fn code(text: &str) -> String {
-    let lines = text.lines().map(|line| line.split("//").next().unwrap_or_default());
+    let lines = text
+        .lines()
+        .map(|line| line.split("//").next().unwrap_or_default());
     lines.collect::<Vec<_>>().join("\n")
 }
 
 /// `src/geometry/sfm.rs` belongs to `geometry`, `src/pose.rs` to `pose`.
 fn module_of(path: &Path) -> String {
     let inside = path.strip_prefix("src").unwrap();
-    inside.components().next().unwrap().as_os_str().to_str().unwrap().trim_end_matches(".rs").to_owned()
+    inside
+        .components()
+        .next()
+        .unwrap()
+        .as_os_str()
+        .to_str()
+        .unwrap()
+        .trim_end_matches(".rs")
+        .to_owned()
 }
 
 /// Uses of a module that stands below the user's own.
 fn upward(layers: &[String], module: &str, text: &str) -> Vec<String> {
-    let Some(own) = layers.iter().position(|layer| layer == module) else { return Vec::new() };
+    let Some(own) = layers.iter().position(|layer| layer == module) else {
+        return Vec::new();
+    };
     let code = code(text);
     let names = code.split("crate::").skip(1).map(|rest| {
-        rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>()
+        rest.chars()
+            .take_while(|c| c.is_alphanumeric() || *c == '_')
+            .collect::<String>()
     });
-    names.filter(|name| layers.iter().position(|layer| layer == name).is_some_and(|ix| ix > own)).collect()
+    names
+        .filter(|name| {
+            layers
+                .iter()
+                .position(|layer| layer == name)
+                .is_some_and(|ix| ix > own)
+        })
+        .collect()
 }
 
 #[test]
 fn a_module_uses_only_modules_above_it() {
     let layers = layers();
-    assert!(layers.len() > 10, "lib.rs lists its modules as `pub mod name;`");
+    assert!(
+        layers.len() > 10,
+        "lib.rs lists its modules as `pub mod name;`"
+    );
     for path in rust_files(Path::new("src")) {
         let text = fs::read_to_string(&path).unwrap();
         let found = upward(&layers, &module_of(&path), &text);
-        assert!(found.is_empty(), "{} uses {found:?}, which stand below it in lib.rs", path.display());
+        assert!(
+            found.is_empty(),
+            "{} uses {found:?}, which stand below it in lib.rs",
+            path.display()
+        );
     }
 }
 
 #[test]
 fn an_upward_use_would_be_seen() {
     let layers = layers();
-    assert_eq!(upward(&layers, "pose", "use crate::map::SplatMap;"), ["map"]);
+    assert_eq!(
+        upward(&layers, "pose", "use crate::map::SplatMap;"),
+        ["map"]
+    );
     assert!(upward(&layers, "map", "use crate::pose::Rigid; // crate::node").is_empty());
 }
 
@@ -79,7 +112,10 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("serde_saphyr", &["src/config", "src/source/"][..]),
         ("yuv", &["src/source/"][..]),
         ("fast_image_resize", &["src/frame.rs", "src/source/"][..]),
-        ("kornia_imgproc", &["src/select", "src/geometry/", "src/source/"][..]),
+        (
+            "kornia_imgproc",
+            &["src/select", "src/geometry/", "src/source/"][..],
+        ),
         ("kornia_3d", &["src/geometry/"][..]),
         ("wgpu", &["src/gpu/"][..]),
         ("multiversion", &["src/splat/cpu/", "src/geometry/"][..]),
@@ -91,11 +127,17 @@ fn each_outside_crate_has_one_home() {
     for path in rust_files(Path::new("src")) {
         let code = code(&fs::read_to_string(&path).unwrap());
         for (name, places) in homes() {
-            let is_used = code.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':')).any(|word| {
-                word.starts_with(&format!("{name}::"))
-            });
-            let is_home = places.iter().any(|place| path.to_str().unwrap().starts_with(place));
-            assert!(!is_used || is_home, "{name} is used outside {places:?}: {}", path.display());
+            let is_used = code
+                .split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':'))
+                .any(|word| word.starts_with(&format!("{name}::")));
+            let is_home = places
+                .iter()
+                .any(|place| path.to_str().unwrap().starts_with(place));
+            assert!(
+                !is_used || is_home,
+                "{name} is used outside {places:?}: {}",
+                path.display()
+            );
         }
     }
 }
@@ -105,7 +147,11 @@ fn files_stay_within_400_lines() {
     for folder in ["src", "tests", "benches", "examples"] {
         for path in rust_files(Path::new(folder)) {
             let n = fs::read_to_string(&path).unwrap().lines().count();
-            assert!(n <= 400, "{} has {n} lines: split it by meaning", path.display());
+            assert!(
+                n <= 400,
+                "{} has {n} lines: split it by meaning",
+                path.display()
+            );
         }
     }
 }

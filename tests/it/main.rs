@@ -1,5 +1,8 @@
 //! All integration tests in one binary: one link of the dependencies.
-#![allow(unreachable_pub, reason = "nothing outside uses a test binary; pub says what other modules may use")]
+#![allow(
+    unreachable_pub,
+    reason = "nothing outside uses a test binary; pub says what other modules may use"
+)]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod backends;
@@ -14,6 +17,7 @@ mod hostile_splats;
 mod html;
 mod layers;
 mod lenses;
+mod node_over_zenoh;
 mod opening;
 mod over_zenoh;
 mod pictures;
@@ -21,6 +25,7 @@ mod publish;
 mod reference;
 mod render;
 mod render_poses;
+mod replay;
 mod report;
 mod scenes;
 mod sfm;

@@ -22,10 +22,10 @@ use zenoh::{Config, Session, Wait};
 
 use crate::formats::random_snapshot;
 
-const MAX_BYTES: usize = 64 << 20;
+pub const MAX_BYTES: usize = 64 << 20;
 
 /// Loopback delivers in milliseconds; so long waits only a test that fails.
-const PATIENCE: Duration = Duration::from_secs(20);
+pub const PATIENCE: Duration = Duration::from_secs(20);
 
 fn params(listen: &str) -> PublishParams {
     let mut params = Settings::shipped().params().unwrap().publish;
@@ -34,15 +34,27 @@ fn params(listen: &str) -> PublishParams {
     params
 }
 
-fn client(listen: &str, connect: &str) -> Session {
+pub fn client(listen: &str, connect: &str) -> Session {
     let mut config = Config::default();
-    config.insert_json5("scouting/multicast/enabled", "false").unwrap();
-    config.insert_json5("listen/endpoints", &format!("[{listen:?}]").replace("\"\"", "")).unwrap();
-    config.insert_json5("connect/endpoints", &format!("[{connect:?}]").replace("\"\"", "")).unwrap();
+    config
+        .insert_json5("scouting/multicast/enabled", "false")
+        .unwrap();
+    config
+        .insert_json5(
+            "listen/endpoints",
+            &format!("[{listen:?}]").replace("\"\"", ""),
+        )
+        .unwrap();
+    config
+        .insert_json5(
+            "connect/endpoints",
+            &format!("[{connect:?}]").replace("\"\"", ""),
+        )
+        .unwrap();
     zenoh::open(config).wait().unwrap()
 }
 
-fn take(assembler: &mut Assembler, sample: &Sample) -> Option<Snapshot> {
+pub fn take(assembler: &mut Assembler, sample: &Sample) -> Option<Snapshot> {
     let dds_type = sample.key_expr().as_str().rsplit('/').nth(1).unwrap();
     if dds_type == dds_type_name::<PoseStamped>() {
         return None;
@@ -51,12 +63,19 @@ fn take(assembler: &mut Assembler, sample: &Sample) -> Option<Snapshot> {
 }
 
 /// Asks like a late joiner until the publisher is connected and its snapshot whole.
-fn ask(session: &Session, key: &str) -> Option<Snapshot> {
+pub fn ask(session: &Session, key: &str) -> Option<Snapshot> {
     let started = Stopwatch::start();
     while started.elapsed() < PATIENCE {
         let mut assembler = Assembler::new(MAX_BYTES);
-        let replies = session.get(key).consolidation(ConsolidationMode::None).wait().unwrap();
-        let complete = replies.into_iter().filter_map(|r| r.into_result().ok()).find_map(|s| take(&mut assembler, &s));
+        let replies = session
+            .get(key)
+            .consolidation(ConsolidationMode::None)
+            .wait()
+            .unwrap();
+        let complete = replies
+            .into_iter()
+            .filter_map(|r| r.into_result().ok())
+            .find_map(|s| take(&mut assembler, &s));
         if complete.is_some() {
             return complete;
         }
@@ -66,7 +85,7 @@ fn ask(session: &Session, key: &str) -> Option<Snapshot> {
     None
 }
 
-fn free_endpoint() -> String {
+pub fn free_endpoint() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     format!("tcp/{}", listener.local_addr().unwrap())
 }
@@ -75,8 +94,13 @@ fn free_endpoint() -> String {
 fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
     let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
     let endpoints = publisher.endpoints();
-    assert!(endpoints.len() == 1 && !endpoints[0].ends_with(":0"), "{endpoints:?}");
-    publisher.publish(&Arc::new(random_snapshot(10, 1, 1, 1))).unwrap();
+    assert!(
+        endpoints.len() == 1 && !endpoints[0].ends_with(":0"),
+        "{endpoints:?}"
+    );
+    publisher
+        .publish(&Arc::new(random_snapshot(10, 1, 1, 1)))
+        .unwrap();
     let snapshot = Arc::new(random_snapshot(6000, 7, 1, 2));
     publisher.publish(&snapshot).unwrap();
 
@@ -84,15 +108,20 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
     let received = ask(&session, "0/splat_mapper/**").expect("no snapshot");
     assert!(received == *snapshot);
     let folder = tempfile::tempdir().unwrap();
-    let paths = [folder.path().join("sent.ply"), folder.path().join("received.ply")];
+    let paths = [
+        folder.path().join("sent.ply"),
+        folder.path().join("received.ply"),
+    ];
     ply::write(&snapshot.splats, &paths[0]).unwrap();
     ply::write(&received.splats, &paths[1]).unwrap();
     assert!(std::fs::read(&paths[0]).unwrap() == std::fs::read(&paths[1]).unwrap());
 
     // The pose alone, by its own key.
     let replies = session.get("0/splat_mapper/pose/*/*").wait().unwrap();
-    let poses: Vec<PoseStamped> =
-        replies.into_iter().map(|r| ros::decode(&r.into_result().unwrap().payload().to_bytes()).unwrap()).collect();
+    let poses: Vec<PoseStamped> = replies
+        .into_iter()
+        .map(|r| ros::decode(&r.into_result().unwrap().payload().to_bytes()).unwrap())
+        .collect();
     assert_eq!(poses.len(), 1);
     assert_eq!(poses[0].pose, snapshot.poses[6].map_from_cam.into());
     publisher.close().unwrap();
@@ -102,7 +131,10 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
 fn a_subscriber_that_was_there_first_receives_every_revision() {
     let endpoint = free_endpoint();
     let session = client(&endpoint, "");
-    let live = session.declare_subscriber("7/robot/mapper/**").wait().unwrap();
+    let live = session
+        .declare_subscriber("7/robot/mapper/**")
+        .wait()
+        .unwrap();
     let mut params = params("");
     params.zenoh_connect = endpoint;
     params.namespace = "robot/mapper".to_owned();
@@ -110,24 +142,46 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
     let mut publisher = ZenohPublisher::open(&params).unwrap();
     assert!(publisher.endpoints().is_empty());
     // Publishing begins when the peers know each other.
-    let matching = session.liveliness().declare_subscriber("@ros2_lv/7/**").history(true).wait().unwrap();
-    let tokens: Vec<String> =
-        (0..5).map(|_| matching.recv_timeout(PATIENCE).unwrap().expect("no token").key_expr().to_string()).collect();
+    let matching = session
+        .liveliness()
+        .declare_subscriber("@ros2_lv/7/**")
+        .history(true)
+        .wait()
+        .unwrap();
+    let tokens: Vec<String> = (0..5)
+        .map(|_| {
+            matching
+                .recv_timeout(PATIENCE)
+                .unwrap()
+                .expect("no token")
+                .key_expr()
+                .to_string()
+        })
+        .collect();
     let name = "/%/%robot/mapper";
-    assert!(tokens.iter().all(|token| token.contains(name)), "{tokens:?}");
-    assert!(tokens.iter().any(|token| token.contains("/%robot%mapper%splats%manifest/splat_mapper_msgs::msg")));
+    assert!(
+        tokens.iter().all(|token| token.contains(name)),
+        "{tokens:?}"
+    );
+    assert!(
+        tokens
+            .iter()
+            .any(|token| token.contains("/%robot%mapper%splats%manifest/splat_mapper_msgs::msg"))
+    );
 
-    let snapshots: Vec<Arc<Snapshot>> =
-        (1..4).map(|revision| Arc::new(random_snapshot(3000, 3, 1, revision))).collect();
+    let snapshots: Vec<Arc<Snapshot>> = (1..4)
+        .map(|revision| Arc::new(random_snapshot(3000, 3, 1, revision)))
+        .collect();
     let mut assembler = Assembler::new(MAX_BYTES);
     for snapshot in &snapshots {
         publisher.publish(snapshot).unwrap();
         let received =
-            std::iter::repeat_with(|| live.recv_timeout(PATIENCE).unwrap().expect("silence")).find_map(|sample| {
-                let attachment = sample.attachment().unwrap().to_bytes();
-                assert_eq!((attachment.len(), attachment[16]), (33, 16));
-                take(&mut assembler, &sample)
-            });
+            std::iter::repeat_with(|| live.recv_timeout(PATIENCE).unwrap().expect("silence"))
+                .find_map(|sample| {
+                    let attachment = sample.attachment().unwrap().to_bytes();
+                    assert_eq!((attachment.len(), attachment[16]), (33, 16));
+                    take(&mut assembler, &sample)
+                });
         assert!(received.as_ref() == Some(&**snapshot));
     }
     publisher.close().unwrap();
@@ -141,9 +195,18 @@ fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
     publisher.publish(&snapshot).unwrap();
     ask(&session, "0/splat_mapper/**").expect("no snapshot");
     for ix in 0..200_u32 {
-        session.put("0/splat_mapper/splats/manifest/x/y", vec![0xff; 1000]).wait().unwrap();
+        session
+            .put("0/splat_mapper/splats/manifest/x/y", vec![0xff; 1000])
+            .wait()
+            .unwrap();
         // Answers nobody reads.
-        drop(session.get("0/splat_mapper/**").payload(ix.to_le_bytes().to_vec()).wait().unwrap());
+        drop(
+            session
+                .get("0/splat_mapper/**")
+                .payload(ix.to_le_bytes().to_vec())
+                .wait()
+                .unwrap(),
+        );
     }
     assert!(ask(&session, "0/splat_mapper/**").as_ref() == Some(&*snapshot));
     publisher.close().unwrap();
@@ -158,14 +221,22 @@ struct Wire {
 impl Wire {
     fn new(endpoint: &str) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let wire = Self { endpoint: format!("tcp/{}", listener.local_addr().unwrap()), stalled: Arc::default() };
-        let (address, stalled) = (endpoint.strip_prefix("tcp/").unwrap().to_owned(), Arc::clone(&wire.stalled));
+        let wire = Self {
+            endpoint: format!("tcp/{}", listener.local_addr().unwrap()),
+            stalled: Arc::default(),
+        };
+        let (address, stalled) = (
+            endpoint.strip_prefix("tcp/").unwrap().to_owned(),
+            Arc::clone(&wire.stalled),
+        );
         let named = |name: &str| std::thread::Builder::new().name(name.to_owned());
         let carry = move || {
             let (near, _) = listener.accept().unwrap();
             let far = TcpStream::connect(address).unwrap();
             let (mut near_in, mut far_out) = (near.try_clone().unwrap(), far.try_clone().unwrap());
-            named("wire-out").spawn(move || std::io::copy(&mut near_in, &mut far_out)).unwrap();
+            named("wire-out")
+                .spawn(move || std::io::copy(&mut near_in, &mut far_out))
+                .unwrap();
             let (mut far, mut near, mut bytes) = (far, near, [0; 4096]);
             while let Ok(n @ 1..) = far.read(&mut bytes) {
                 near.write_all(&bytes[..n]).unwrap();
@@ -188,10 +259,16 @@ fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
     publisher.publish(&snapshot(1)).unwrap();
     let wire = Wire::new(&endpoint);
     let stuck = client("", &wire.endpoint);
-    let _stuck_live = stuck.declare_subscriber("0/splat_mapper/**").wait().unwrap();
+    let _stuck_live = stuck
+        .declare_subscriber("0/splat_mapper/**")
+        .wait()
+        .unwrap();
     ask(&stuck, "0/splat_mapper/**").expect("no snapshot before the stall");
     let session = client("", &endpoint);
-    let live = session.declare_subscriber("0/splat_mapper/**").wait().unwrap();
+    let live = session
+        .declare_subscriber("0/splat_mapper/**")
+        .wait()
+        .unwrap();
     ask(&session, "0/splat_mapper/**").expect("no snapshot for the healthy one");
     wire.stalled.store(true, Ordering::Relaxed);
 
@@ -204,15 +281,24 @@ fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
                 .filter_map(|sample| take(&mut assembler, &sample))
                 .find(|snapshot| snapshot.revision == 4)
         });
-        [snapshot(2), snapshot(3), Arc::clone(&last)].iter().for_each(|s| publisher.publish(s).unwrap());
+        [snapshot(2), snapshot(3), Arc::clone(&last)]
+            .iter()
+            .for_each(|s| publisher.publish(s).unwrap());
         receiver.join().unwrap()
     });
     assert!(received.as_ref() == Some(&*last));
-    assert!(started.secs() > 1.5, "{} s: nothing stalled, so nothing was tested", started.secs());
+    assert!(
+        started.secs() > 1.5,
+        "{} s: nothing stalled, so nothing was tested",
+        started.secs()
+    );
     // zenoh lingers ten seconds over bytes that the stalled peer never took; we do not.
     let closing = Stopwatch::start();
     let closed = publisher.close();
-    assert!(closing.secs() < 2.5 && matches!(closed, Ok(()) | Err(PublishError::Close { .. })), "{closed:?}");
+    assert!(
+        closing.secs() < 2.5 && matches!(closed, Ok(()) | Err(PublishError::Close { .. })),
+        "{closed:?}"
+    );
     wire.stalled.store(false, Ordering::Relaxed);
 }
 
@@ -225,7 +311,11 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let mut publisher = ZenohPublisher::open(&params).unwrap();
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
     publisher.publish(&snapshot).unwrap();
-    assert!(started.secs() < 5.0, "{} s with nobody there", started.secs());
+    assert!(
+        started.secs() < 5.0,
+        "{} s with nobody there",
+        started.secs()
+    );
     assert!(ask(&client(&endpoint, ""), "0/splat_mapper/**").as_ref() == Some(&*snapshot));
     publisher.close().unwrap();
 }
@@ -243,8 +333,9 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("zenoh.json5");
     let endpoint = free_endpoint();
-    let text =
-        format!("{{ listen: {{ endpoints: [{endpoint:?}] }}, scouting: {{ multicast: {{ enabled: false }} }} }}");
+    let text = format!(
+        "{{ listen: {{ endpoints: [{endpoint:?}] }}, scouting: {{ multicast: {{ enabled: false }} }} }}"
+    );
     std::fs::write(&path, text).unwrap();
     let mut params = params("nonsense that nobody reads");
     params.zenoh_config = path.display().to_string();
@@ -257,7 +348,10 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
 
     std::fs::write(&path, "{ listen: ").unwrap();
     let fault = ZenohPublisher::open(&params).unwrap_err().to_string();
-    assert!(fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"), "{fault}");
+    assert!(
+        fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"),
+        "{fault}"
+    );
 }
 
 #[test]
@@ -277,5 +371,8 @@ fn errors_name_the_parameter() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("tcp/{}", listener.local_addr().unwrap());
     let fault = ZenohPublisher::open(&params(&taken)).unwrap_err();
-    assert!(matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken), "{fault}");
+    assert!(
+        matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken),
+        "{fault}"
+    );
 }

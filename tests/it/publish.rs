@@ -3,7 +3,9 @@
 use splat_mapper::map::snapshot::Snapshot;
 use splat_mapper::publish::assemble::{Assembler, Counts};
 use splat_mapper::publish::type_hash::{dds_type_name, type_hash};
-use splat_mapper::publish::wire::{self, KeyframeArray, KeyframePoseMsg, Messages, SplatChunk, SplatManifest};
+use splat_mapper::publish::wire::{
+    self, KeyframeArray, KeyframePoseMsg, Messages, SplatChunk, SplatManifest,
+};
 use splat_mapper::ros::{self, Image, PoseStamped, TfMessage};
 
 use crate::formats::{Dice, random_snapshot};
@@ -41,20 +43,35 @@ fn shuffle<T>(items: &mut [T], dice: &mut Dice) {
 #[test]
 fn pieces_in_any_order_and_twice_give_the_snapshot_once() {
     let mut dice = Dice(3);
-    for (n_splats, n_keyframes, sh_degree) in
-        [(1000, 25, 1), (400, 1, 3), (700, 60, 0), (0, 4, 1), (0, 0, 0), (5, 0, 2)]
-    {
+    for (n_splats, n_keyframes, sh_degree) in [
+        (1000, 25, 1),
+        (400, 1, 3),
+        (700, 60, 0),
+        (0, 4, 1),
+        (0, 0, 0),
+        (5, 0, 2),
+    ] {
         let snapshot = random_snapshot(n_splats, n_keyframes, sh_degree, 4);
         let mut sent = pieces(&snapshot, 2048);
         sent.extend(sent.clone());
         shuffle(&mut sent, &mut dice);
         let n_sent = sent.len() as u64;
         let mut assembler = Assembler::new(MAX_BYTES);
-        let received: Vec<Snapshot> = sent.into_iter().filter_map(|piece| add(&mut assembler, piece)).collect();
+        let received: Vec<Snapshot> = sent
+            .into_iter()
+            .filter_map(|piece| add(&mut assembler, piece))
+            .collect();
         assert_eq!(received.len(), 1);
         assert!(received[0] == snapshot);
         let half = n_sent / 2;
-        assert_eq!(assembler.counts(), Counts { used: half, superfluous: half, ..Counts::default() });
+        assert_eq!(
+            assembler.counts(),
+            Counts {
+                used: half,
+                superfluous: half,
+                ..Counts::default()
+            }
+        );
     }
 }
 
@@ -66,7 +83,10 @@ fn one_lost_piece_of_any_kind_holds_a_snapshot_back_until_it_comes_again() {
     for lost in 0..sent.len() {
         let mut assembler = Assembler::new(MAX_BYTES);
         for (ix, piece) in sent.iter().enumerate().filter(|(ix, _)| *ix != lost) {
-            assert!(add(&mut assembler, piece.clone()).is_none(), "complete with {ix} although {lost} is missing");
+            assert!(
+                add(&mut assembler, piece.clone()).is_none(),
+                "complete with {ix} although {lost} is missing"
+            );
         }
         assert!(add(&mut assembler, sent[lost].clone()).as_ref() == Some(&snapshot));
     }
@@ -74,13 +94,20 @@ fn one_lost_piece_of_any_kind_holds_a_snapshot_back_until_it_comes_again() {
 
 #[test]
 fn interleaved_revisions_come_out_whole_and_never_backwards() {
-    let snapshots = [1, 2, 3].map(|revision| random_snapshot(200 * revision as usize, 5, 1, revision));
+    let snapshots =
+        [1, 2, 3].map(|revision| random_snapshot(200 * revision as usize, 5, 1, revision));
     let mut dice = Dice(8);
     for _ in 0..20 {
-        let mut sent: Vec<Piece> = snapshots.iter().flat_map(|snapshot| pieces(snapshot, 2048)).collect();
+        let mut sent: Vec<Piece> = snapshots
+            .iter()
+            .flat_map(|snapshot| pieces(snapshot, 2048))
+            .collect();
         shuffle(&mut sent, &mut dice);
         let mut assembler = Assembler::new(MAX_BYTES);
-        let received: Vec<Snapshot> = sent.into_iter().filter_map(|piece| add(&mut assembler, piece)).collect();
+        let received: Vec<Snapshot> = sent
+            .into_iter()
+            .filter_map(|piece| add(&mut assembler, piece))
+            .collect();
         assert!(received.iter().all(|snapshot| snapshots.contains(snapshot)));
         assert!(received.is_sorted_by_key(|snapshot| snapshot.revision));
         assert!(received.last() == Some(&snapshots[2]));
@@ -93,7 +120,10 @@ fn a_new_map_begins_again_at_a_lower_revision() {
     new.map_id[0] ^= 1;
     let mut assembler = Assembler::new(MAX_BYTES);
     for snapshot in [&old, &new] {
-        let last = pieces(snapshot, 2048).into_iter().filter_map(|piece| add(&mut assembler, piece)).last();
+        let last = pieces(snapshot, 2048)
+            .into_iter()
+            .filter_map(|piece| add(&mut assembler, piece))
+            .last();
         assert!(last.as_ref() == Some(snapshot));
     }
 }
@@ -146,7 +176,10 @@ fn a_forged_chunk_with_a_fitting_crc_never_becomes_a_map() {
     }
     assert_eq!(assembler.counts().rejected, sent.len() as u64);
     // Nothing of it sticks: the same revision completes when it is sent again.
-    let again = sent.into_iter().filter_map(|piece| add(&mut assembler, piece)).last();
+    let again = sent
+        .into_iter()
+        .filter_map(|piece| add(&mut assembler, piece))
+        .last();
     assert!(again == Some(snapshot));
 }
 
@@ -166,13 +199,21 @@ fn made_up_counts_and_endless_revisions_stay_within_the_byte_bound() {
             ..chunk.clone()
         };
         assert!(assembler.add_chunk(forged).is_none());
-        let empty = KeyframeArray { n_keyframes: u32::MAX, first_ix: ix, revision: 5, ..KeyframeArray::default() };
+        let empty = KeyframeArray {
+            n_keyframes: u32::MAX,
+            first_ix: ix,
+            revision: 5,
+            ..KeyframeArray::default()
+        };
         assert!(assembler.add_keyframes(empty).is_none());
     }
     let counts = assembler.counts();
     // What is neither rejected nor abandoned is held.
     let held = counts.used - counts.abandoned;
-    assert!(counts.used > 30_000 && held * 128 <= max_bytes as u64, "{counts:?}");
+    assert!(
+        counts.used > 30_000 && held * 128 <= max_bytes as u64,
+        "{counts:?}"
+    );
 }
 
 #[test]
@@ -182,9 +223,18 @@ fn payloads_of_noise_are_rejected_one_by_one() {
     let snapshot = random_snapshot(200, 5, 1, 4);
     let messages = Messages::new(&snapshot, 4096);
     let good = [
-        (dds_type_name::<SplatChunk>(), wire::payload(&messages.chunks().next().unwrap()).unwrap()),
-        (dds_type_name::<SplatManifest>(), wire::payload(&messages.manifest()).unwrap()),
-        (dds_type_name::<KeyframeArray>(), wire::payload(&messages.keyframes().next().unwrap()).unwrap()),
+        (
+            dds_type_name::<SplatChunk>(),
+            wire::payload(&messages.chunks().next().unwrap()).unwrap(),
+        ),
+        (
+            dds_type_name::<SplatManifest>(),
+            wire::payload(&messages.manifest()).unwrap(),
+        ),
+        (
+            dds_type_name::<KeyframeArray>(),
+            wire::payload(&messages.keyframes().next().unwrap()).unwrap(),
+        ),
     ];
     let mut n_sent = 0;
     for round in 0..3000 {
@@ -193,15 +243,25 @@ fn payloads_of_noise_are_rejected_one_by_one() {
         match round % 4 {
             0 => payload.truncate(dice.below(payload.len())),
             1 => (0..8).for_each(|_| payload[dice.below(200) % 60] = dice.roll() as u8),
-            2 => payload.iter_mut().for_each(|byte| *byte = dice.roll() as u8),
+            2 => payload
+                .iter_mut()
+                .for_each(|byte| *byte = dice.roll() as u8),
             _ => payload = vec![0xff; dice.below(64)],
         }
         assert!(assembler.add_payload(dds_type, &payload).is_none());
         n_sent += 1;
     }
-    assert!(assembler.add_payload("std_msgs::msg::dds_::String_", &good[0].1).is_none());
+    assert!(
+        assembler
+            .add_payload("std_msgs::msg::dds_::String_", &good[0].1)
+            .is_none()
+    );
     let counts = assembler.counts();
-    assert_eq!(counts.used + counts.superfluous + counts.rejected, n_sent + 1, "{counts:?}");
+    assert_eq!(
+        counts.used + counts.superfluous + counts.rejected,
+        n_sent + 1,
+        "{counts:?}"
+    );
 }
 
 #[test]
@@ -212,8 +272,15 @@ fn messages_keep_their_size_bounds() {
         for chunk in messages.chunks() {
             assert!(chunk.data.len() <= chunk_bytes.min(512 << 10));
         }
-        let largest = messages.keyframes().map(|array| wire::payload(&array).unwrap().len()).max().unwrap();
-        assert!(largest <= chunk_bytes.saturating_add(200).min(wire::MAX_MESSAGE_BYTES), "{largest} at {chunk_bytes}");
+        let largest = messages
+            .keyframes()
+            .map(|array| wire::payload(&array).unwrap().len())
+            .max()
+            .unwrap();
+        assert!(
+            largest <= chunk_bytes.saturating_add(200).min(wire::MAX_MESSAGE_BYTES),
+            "{largest} at {chunk_bytes}"
+        );
     }
 }
 
@@ -222,9 +289,15 @@ fn messages_survive_cdr() {
     let snapshot = random_snapshot(100, 3, 1, 4);
     let messages = Messages::new(&snapshot, 4096);
     let chunk = messages.chunks().nth(1).unwrap();
-    assert_eq!(ros::decode::<SplatChunk>(&wire::payload(&chunk).unwrap()).unwrap(), chunk);
+    assert_eq!(
+        ros::decode::<SplatChunk>(&wire::payload(&chunk).unwrap()).unwrap(),
+        chunk
+    );
     let array = messages.keyframes().next().unwrap();
-    assert_eq!(ros::decode::<KeyframeArray>(&wire::payload(&array).unwrap()).unwrap(), array);
+    assert_eq!(
+        ros::decode::<KeyframeArray>(&wire::payload(&array).unwrap()).unwrap(),
+        array
+    );
     let pose = messages.pose().unwrap();
     assert_eq!(pose.pose, snapshot.poses[2].map_from_cam.into());
     assert_eq!(pose.header.frame_id, "map");
@@ -236,15 +309,36 @@ fn messages_survive_cdr() {
 /// also by rosidl of ROS 2 Jazzy.
 #[test]
 fn type_hashes_are_those_of_ros_2() {
-    assert_eq!(type_hash::<PoseStamped>(), "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8");
-    assert_eq!(type_hash::<Image>(), "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47");
-    assert_eq!(type_hash::<TfMessage>(), "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087");
-    assert_eq!(type_hash::<SplatChunk>(), "RIHS01_151a9b7a03a5724d3969b9ee1419ffe8d12217df8ea78786242c8855d97fb54a");
-    assert_eq!(type_hash::<SplatManifest>(), "RIHS01_ecae8b360482dcaabd4d9452c7edb9b4a99d155ddb3c3a1e09ee3e208f61da37");
+    assert_eq!(
+        type_hash::<PoseStamped>(),
+        "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+    );
+    assert_eq!(
+        type_hash::<Image>(),
+        "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47"
+    );
+    assert_eq!(
+        type_hash::<TfMessage>(),
+        "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+    );
+    assert_eq!(
+        type_hash::<SplatChunk>(),
+        "RIHS01_151a9b7a03a5724d3969b9ee1419ffe8d12217df8ea78786242c8855d97fb54a"
+    );
+    assert_eq!(
+        type_hash::<SplatManifest>(),
+        "RIHS01_ecae8b360482dcaabd4d9452c7edb9b4a99d155ddb3c3a1e09ee3e208f61da37"
+    );
     assert_eq!(
         type_hash::<KeyframePoseMsg>(),
         "RIHS01_15510c85564875936e57a31e7da2260c6c89ac8dcd818864e4ea564aacf4b2b8"
     );
-    assert_eq!(type_hash::<KeyframeArray>(), "RIHS01_806a2f07d3cfca046a753e9369f2660b97174ae473b33db404d701f8a62a4e8a");
-    assert_eq!(dds_type_name::<PoseStamped>(), "geometry_msgs::msg::dds_::PoseStamped_");
+    assert_eq!(
+        type_hash::<KeyframeArray>(),
+        "RIHS01_806a2f07d3cfca046a753e9369f2660b97174ae473b33db404d701f8a62a4e8a"
+    );
+    assert_eq!(
+        dds_type_name::<PoseStamped>(),
+        "geometry_msgs::msg::dds_::PoseStamped_"
+    );
 }

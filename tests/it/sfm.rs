@@ -21,14 +21,26 @@ pub(crate) struct Shown {
 /// Every `stride`-th picture of a scene's folder, at most `max_side` pixels long, with its reference pose.
 pub(crate) fn shown(folder: &Path, max_side: u32, stride: usize, calibrated: bool) -> Shown {
     let list = std::fs::read_to_string(folder.join("images.txt")).unwrap();
-    let rows = list.lines().filter(|l| !l.starts_with('#')).filter_map(|l| l.split_once(' '));
+    let rows = list
+        .lines()
+        .filter(|l| !l.starts_with('#'))
+        .filter_map(|l| l.split_once(' '));
     let poses = reference(&folder.join("poses_tum.txt"));
     let (mut keyframes, mut truth) = (Vec::new(), Vec::new());
     for (time, name) in rows.step_by(stride) {
         let time: f64 = time.parse().unwrap();
-        let Some((_, pose)) = poses.iter().find(|p| (p.0 - time).abs() < 1e-4) else { continue };
+        let Some((_, pose)) = poses.iter().find(|p| (p.0 - time).abs() < 1e-4) else {
+            continue;
+        };
         let image = image::open(folder.join(name.trim())).unwrap().to_rgb8();
-        keyframes.push(keyframe(keyframes.len() as u32, time, &image, max_side, &intrinsics(folder), calibrated));
+        keyframes.push(keyframe(
+            keyframes.len() as u32,
+            time,
+            &image,
+            max_side,
+            &intrinsics(folder),
+            calibrated,
+        ));
         truth.push(*pose);
     }
     Shown { keyframes, truth }
@@ -49,12 +61,20 @@ pub(crate) fn keyframe(
     let frame = Frame {
         seq: u64::from(id),
         stamp: Stamp::from_secs(time),
-        image: Arc::new(RgbImage { width_px: w, height_px: h, pixels: small.into_raw() }),
+        image: Arc::new(RgbImage {
+            width_px: w,
+            height_px: h,
+            pixels: small.into_raw(),
+        }),
         intrinsics: calibrated.then(|| lens.resized(w, h)),
         truth: None,
         truth_depth: None,
     };
-    Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
+    Arc::new(Keyframe {
+        id,
+        frame,
+        age: Stopwatch::start(),
+    })
 }
 
 pub(crate) fn intrinsics(folder: &Path) -> Intrinsics {
@@ -74,10 +94,22 @@ pub(crate) fn intrinsics(folder: &Path) -> Intrinsics {
 pub(crate) fn reference(path: &Path) -> Vec<(f64, Rigid)> {
     let text = std::fs::read_to_string(path).unwrap();
     let row = |line: &str| {
-        let v: Vec<f64> = line.split_whitespace().map(|w| w.parse().unwrap()).collect();
-        (v[0], Rigid::new(DQuat::from_xyzw(v[4], v[5], v[6], v[7]).normalize(), DVec3::new(v[1], v[2], v[3])))
+        let v: Vec<f64> = line
+            .split_whitespace()
+            .map(|w| w.parse().unwrap())
+            .collect();
+        (
+            v[0],
+            Rigid::new(
+                DQuat::from_xyzw(v[4], v[5], v[6], v[7]).normalize(),
+                DVec3::new(v[1], v[2], v[3]),
+            ),
+        )
     };
-    text.lines().filter(|l| !l.starts_with('#') && !l.trim().is_empty()).map(row).collect()
+    text.lines()
+        .filter(|l| !l.starts_with('#') && !l.trim().is_empty())
+        .map(row)
+        .collect()
 }
 
 #[derive(Debug)]
@@ -86,24 +118,21 @@ pub(crate) struct Figures {
     pub(crate) components: usize,
     pub(crate) ate_percent: f64,
     pub(crate) rotation_deg: f64,
-    pub(crate) secs_per_keyframe: f64,
-    pub(crate) focal: f64,
     pub(crate) note: Option<String>,
 }
 
 /// Batches of 8 that share 3, as the node makes them, then the end.
 pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let mut settings = Settings::shipped();
-    changes.iter().for_each(|change| settings.merge_setting(change).unwrap());
+    changes
+        .iter()
+        .for_each(|change| settings.merge_setting(change).unwrap());
     let params = settings.params().unwrap();
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
     let mut poses = std::collections::BTreeMap::new();
-    let mut focal = 0.0;
-    let watch = Stopwatch::start();
     let mut take = |out: &SparseBatch| {
         for view in &out.views {
             poses.insert(view.keyframe_id, (view.component, view.batch_from_cam));
-            focal = view.intrinsics.fx;
         }
         for (id, component, pose) in &out.revised {
             poses.insert(*id, (*component, *pose));
@@ -114,24 +143,30 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
         let shared = if batch_id == 0 { 0 } else { 3 };
         let until = (from + 8 - shared).min(shown.keyframes.len());
         let keyframes = shown.keyframes[from - shared..until].to_vec();
-        take(&sfm.sparse(&Batch { id: batch_id, n_shared: shared, keyframes }));
+        take(&sfm.sparse(&Batch {
+            id: batch_id,
+            n_shared: shared,
+            keyframes,
+        }));
         (from, batch_id) = (until, batch_id + 1);
     }
     let last = sfm.finish_sparse();
     take(&last);
-    let secs = watch.secs();
     let components: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
-    let largest = components.iter().max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
-    let pairs: Vec<(Rigid, Rigid)> =
-        poses.iter().filter(|(_, p)| Some(&p.0) == largest).map(|(id, p)| (shown.truth[*id as usize], p.1)).collect();
+    let largest = components
+        .iter()
+        .max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
+    let pairs: Vec<(Rigid, Rigid)> = poses
+        .iter()
+        .filter(|(_, p)| Some(&p.0) == largest)
+        .map(|(id, p)| (shown.truth[*id as usize], p.1))
+        .collect();
     let (ate_percent, rotation_deg) = errors(&pairs);
     Figures {
         registered: pairs.len(),
         components: components.len(),
         ate_percent,
         rotation_deg,
-        secs_per_keyframe: secs / shown.keyframes.len() as f64,
-        focal,
         note: last.note,
     }
 }
@@ -148,7 +183,8 @@ fn errors(pairs: &[(Rigid, Rigid)]) -> (f64, f64) {
     let mut variance = 0.0;
     for (truth, own) in pairs {
         let (t, o) = (truth.translation - truth_mean, own.translation - own_mean);
-        covariance += nalgebra::Vector3::new(t.x, t.y, t.z) * nalgebra::RowVector3::new(o.x, o.y, o.z) / n;
+        covariance +=
+            nalgebra::Vector3::new(t.x, t.y, t.z) * nalgebra::RowVector3::new(o.x, o.y, o.z) / n;
         variance += o.length_squared() / n;
     }
     let svd = covariance.svd(true, true);
@@ -162,14 +198,24 @@ fn errors(pairs: &[(Rigid, Rigid)]) -> (f64, f64) {
     let rotation = DQuat::from_mat3(&glam::DMat3::from_cols_slice(r.as_slice()));
     let mut extent: f64 = 0.0;
     for (a, _) in pairs {
-        extent = pairs.iter().map(|(b, _)| a.translation.distance(b.translation)).fold(extent, f64::max);
+        extent = pairs
+            .iter()
+            .map(|(b, _)| a.translation.distance(b.translation))
+            .fold(extent, f64::max);
     }
     let off = |(t, o): &(Rigid, Rigid)| {
         (rotation * (o.translation - own_mean) * scale + truth_mean).distance_squared(t.translation)
     };
     let rmse = (pairs.iter().map(off).sum::<f64>() / n).sqrt();
-    let turned = |(t, o): &(Rigid, Rigid)| Rigid::new(rotation * o.rotation, DVec3::ZERO).angle_to(t).to_degrees();
-    (100.0 * rmse / extent, pairs.iter().map(turned).sum::<f64>() / n)
+    let turned = |(t, o): &(Rigid, Rigid)| {
+        Rigid::new(rotation * o.rotation, DVec3::ZERO)
+            .angle_to(t)
+            .to_degrees()
+    };
+    (
+        100.0 * rmse / extent,
+        pairs.iter().map(turned).sum::<f64>() / n,
+    )
 }
 
 #[test]
@@ -177,14 +223,28 @@ fn fox_is_registered_whole_in_one_frame() {
     let Some(folder) = scene("fox") else { return };
     let figures = run(&shown(&folder, 480, 1, true), &["sfm.max_side=480"]);
     eprintln!("fox: {figures:?}");
-    assert!(figures.registered >= 48 && figures.components == 1, "{figures:?}");
-    assert!(figures.ate_percent <= 0.3 && figures.rotation_deg <= 0.5, "{figures:?}");
+    assert!(
+        figures.registered >= 48 && figures.components == 1,
+        "{figures:?}"
+    );
+    assert!(
+        figures.ate_percent <= 0.3 && figures.rotation_deg <= 0.5,
+        "{figures:?}"
+    );
 }
 
 #[test]
 fn a_camera_at_rest_places_nothing_and_says_why() {
-    let Some(folder) = scene("static_euroc") else { return };
+    let Some(folder) = scene("static_euroc") else {
+        return;
+    };
     let figures = run(&shown(&folder, 640, 2, true), &[]);
     assert_eq!(figures.registered, 0, "{figures:?}");
-    assert!(figures.note.as_ref().is_some_and(|n| n.contains(NO_PARALLAX)), "{figures:?}");
+    assert!(
+        figures
+            .note
+            .as_ref()
+            .is_some_and(|n| n.contains(NO_PARALLAX)),
+        "{figures:?}"
+    );
 }

@@ -18,9 +18,16 @@ const SURFACE_GAP: f32 = 0.03;
 /// Views from nearly the same place agree on any depth.
 const MIN_ANGLE_RAD: f64 = 0.008;
 
-pub(super) fn verify(reference: (Rigid, &RawDepth), others: &[(Rigid, &RawDepth)], params: &MvsParams) -> DepthMap {
+pub(super) fn verify(
+    reference: (Rigid, &RawDepth),
+    others: &[(Rigid, &RawDepth)],
+    params: &MvsParams,
+) -> DepthMap {
     let (world_from_cam, raw) = reference;
-    let (width, height) = (raw.intrinsics.width_px as usize, raw.intrinsics.height_px as usize);
+    let (width, height) = (
+        raw.intrinsics.width_px as usize,
+        raw.intrinsics.height_px as usize,
+    );
     let n_pixels = width * height;
     let mut map = DepthMap {
         width_px: raw.intrinsics.width_px,
@@ -28,12 +35,20 @@ pub(super) fn verify(reference: (Rigid, &RawDepth), others: &[(Rigid, &RawDepth)
         depth: raw.depth.clone(),
         confidence: vec![0.0; n_pixels],
     };
-    let others: Vec<Other<'_>> =
-        others.iter().filter_map(|(pose, other)| Other::new(&world_from_cam, pose, other)).collect();
-    if !world_from_cam.is_finite() || !raw.intrinsics.is_plausible() || others.len() < params.min_views {
+    let others: Vec<Other<'_>> = others
+        .iter()
+        .filter_map(|(pose, other)| Other::new(&world_from_cam, pose, other))
+        .collect();
+    if !world_from_cam.is_finite()
+        || !raw.intrinsics.is_plausible()
+        || others.len() < params.min_views
+    {
         return map;
     }
-    let rows = map.depth.par_chunks_mut(width).zip(map.confidence.par_chunks_mut(width));
+    let rows = map
+        .depth
+        .par_chunks_mut(width)
+        .zip(map.confidence.par_chunks_mut(width));
     rows.enumerate().for_each(|(y, (depths, confidences))| {
         for x in 0..width {
             if depths[x] <= 0.0 {
@@ -43,7 +58,11 @@ pub(super) fn verify(reference: (Rigid, &RawDepth), others: &[(Rigid, &RawDepth)
             let agreement = agreement(&raw.intrinsics, pixel, f64::from(depths[x]), &others);
             if agreement.n >= params.min_views {
                 depths[x] = agreement.depth as f32;
-                confidences[x] = confidence(agreement.n, raw.score[y * width + x], raw.margin[y * width + x]);
+                confidences[x] = confidence(
+                    agreement.n,
+                    raw.score[y * width + x],
+                    raw.margin[y * width + x],
+                );
             }
         }
     });
@@ -67,7 +86,11 @@ impl<'a> Other<'a> {
     fn new(world_from_cam: &Rigid, world_from_other: &Rigid, raw: &'a RawDepth) -> Option<Self> {
         let other_from_cam = world_from_other.inverse() * *world_from_cam;
         let usable = other_from_cam.is_finite() && raw.intrinsics.is_plausible();
-        usable.then(|| Self { raw, rotation: other_from_cam.rotation_matrix(), translation: other_from_cam.translation })
+        usable.then(|| Self {
+            raw,
+            rotation: other_from_cam.rotation_matrix(),
+            translation: other_from_cam.translation,
+        })
     }
 }
 
@@ -77,7 +100,12 @@ struct Agreement {
     depth: f64,
 }
 
-fn agreement(intrinsics: &Intrinsics, pixel: glam::DVec2, depth: f64, others: &[Other<'_>]) -> Agreement {
+fn agreement(
+    intrinsics: &Intrinsics,
+    pixel: glam::DVec2,
+    depth: f64,
+    others: &[Other<'_>],
+) -> Agreement {
     let point = intrinsics.ray_in_cam(pixel) * depth;
     let (mut n, mut sum) = (0, depth);
     for other in others {
@@ -85,32 +113,52 @@ fn agreement(intrinsics: &Intrinsics, pixel: glam::DVec2, depth: f64, others: &[
         if other.translation.length_squared() < (MIN_ANGLE_RAD * depth).powi(2) {
             continue;
         }
-        let Some(at) = other.raw.intrinsics.project(in_other) else { continue };
-        let Some(seen) = depth_at(other.raw, at) else { continue };
+        let Some(at) = other.raw.intrinsics.project(in_other) else {
+            continue;
+        };
+        let Some(seen) = depth_at(other.raw, at) else {
+            continue;
+        };
         let seen = other.raw.intrinsics.ray_in_cam(at) * f64::from(seen);
         let back = other.rotation.transpose() * (seen - other.translation);
-        let Some(landed) = intrinsics.project(back) else { continue };
+        let Some(landed) = intrinsics.project(back) else {
+            continue;
+        };
         let is_near = (landed - pixel).length_squared() < MAX_RETURN_PX * MAX_RETURN_PX;
         if is_near && (back.z - depth).abs() < MAX_DEPTH_ERROR * depth {
             n += 1;
             sum += back.z;
         }
     }
-    Agreement { n, depth: sum / (n + 1) as f64 }
+    Agreement {
+        n,
+        depth: sum / (n + 1) as f64,
+    }
 }
 
 /// Depth between the four nearest pixels where they lie on one surface, else of the nearest pixel.
 fn depth_at(raw: &RawDepth, pixel: glam::DVec2) -> Option<f32> {
-    let (width, height) = (raw.intrinsics.width_px as usize, raw.intrinsics.height_px as usize);
+    let (width, height) = (
+        raw.intrinsics.width_px as usize,
+        raw.intrinsics.height_px as usize,
+    );
     if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < width as f64 && pixel.y < height as f64) {
         return None;
     }
     let nearest = raw.depth[pixel.y as usize * width + pixel.x as usize];
     let (u, v) = ((pixel.x - 0.5).max(0.0), (pixel.y - 0.5).max(0.0));
     let (x, y) = ((u as usize).min(width - 2), (v as usize).min(height - 2));
-    let (share_x, share_y) = ((u - x as f64).min(1.0) as f32, (v - y as f64).min(1.0) as f32);
+    let (share_x, share_y) = (
+        (u - x as f64).min(1.0) as f32,
+        (v - y as f64).min(1.0) as f32,
+    );
     let at = y * width + x;
-    let four = [raw.depth[at], raw.depth[at + 1], raw.depth[at + width], raw.depth[at + width + 1]];
+    let four = [
+        raw.depth[at],
+        raw.depth[at + 1],
+        raw.depth[at + width],
+        raw.depth[at + width + 1],
+    ];
     let lowest = four.iter().copied().fold(f32::INFINITY, f32::min);
     let highest = four.iter().copied().fold(0.0, f32::max);
     if lowest <= 0.0 || highest > lowest * (1.0 + SURFACE_GAP) {

@@ -21,9 +21,16 @@ impl Grey {
     /// A picture whose pixels do not fit its size counts as empty.
     pub(super) fn of_image(image: &RgbImage, params: &MvsParams) -> Self {
         let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
-        let fits = from_width.checked_mul(from_height).and_then(|n| n.checked_mul(3)) == Some(image.pixels.len());
+        let fits = from_width
+            .checked_mul(from_height)
+            .and_then(|n| n.checked_mul(3))
+            == Some(image.pixels.len());
         if !fits || image.pixels.is_empty() {
-            return Self { width: 0, height: 0, values: Vec::new() };
+            return Self {
+                width: 0,
+                height: 0,
+                values: Vec::new(),
+            };
         }
         let (width, height) = working_size(from_width, from_height, params);
         let columns = shares(from_width, width);
@@ -35,10 +42,17 @@ impl Grey {
             for (from_y, share_y) in row.cells() {
                 let pixels = &image.pixels[3 * from_y * from_width..3 * (from_y + 1) * from_width];
                 for (value, rgb) in luma.iter_mut().zip(pixels.chunks_exact(3)) {
-                    *value = rgb.iter().zip(LUMA).map(|(&c, weight)| f32::from(c) * weight).sum();
+                    *value = rgb
+                        .iter()
+                        .zip(LUMA)
+                        .map(|(&c, weight)| f32::from(c) * weight)
+                        .sum();
                 }
                 for (value, column) in into.iter_mut().zip(&columns) {
-                    let sum: f32 = column.cells().map(|(from_x, share_x)| share_x * luma[from_x]).sum();
+                    let sum: f32 = column
+                        .cells()
+                        .map(|(from_x, share_x)| share_x * luma[from_x])
+                        .sum();
                     *value += share_y * sum;
                 }
             }
@@ -46,7 +60,11 @@ impl Grey {
                 *value = *value / 255.0 - 0.5;
             }
         }
-        Self { width, height, values }
+        Self {
+            width,
+            height,
+            values,
+        }
     }
 
     pub(super) fn row(&self, y: usize) -> &[f32] {
@@ -60,7 +78,10 @@ fn working_size(width: usize, height: usize, params: &MvsParams) -> (usize, usiz
     let by_side = f64::from(params.max_side) / w.max(h);
     let by_memory = (MAX_CELLS as f64 / (w * h * params.n_depths.max(1) as f64)).sqrt();
     let scale = by_side.min(by_memory).min(1.0);
-    ((w * scale).round().max(1.0) as usize, (h * scale).round().max(1.0) as usize)
+    (
+        (w * scale).round().max(1.0) as usize,
+        (h * scale).round().max(1.0) as usize,
+    )
 }
 
 /// The stretch of old pixels under one new pixel.
@@ -82,5 +103,10 @@ impl Share {
 
 fn shares(from: usize, into: usize) -> Vec<Share> {
     let edge = |ix: usize| ix as f64 * from as f64 / into as f64;
-    (0..into).map(|ix| Share { from: edge(ix), to: edge(ix + 1).min(from as f64) }).collect()
+    (0..into)
+        .map(|ix| Share {
+            from: edge(ix),
+            to: edge(ix + 1).min(from as f64),
+        })
+        .collect()
 }

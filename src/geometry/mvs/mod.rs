@@ -5,6 +5,7 @@
 mod consistency;
 mod grey;
 pub mod neighbours;
+mod planes;
 mod sgm;
 pub mod state;
 mod sweep;
@@ -41,15 +42,37 @@ pub struct RawDepth {
 /// Depth of `reference` by matching it against `sources`, between the planes `near` and `far`.
 ///
 /// Empty (all 0) where nothing can be told: no usable source, no parallax, an impossible range.
-pub fn sweep(reference: &MvsView, sources: &[&MvsView], near: f64, far: f64, params: &MvsParams) -> RawDepth {
+pub fn sweep(
+    reference: &MvsView,
+    sources: &[&MvsView],
+    near: f64,
+    far: f64,
+    params: &MvsParams,
+) -> RawDepth {
     let reference = Prepared::new(reference, params);
-    let sources: Vec<Prepared> = sources.iter().map(|source| Prepared::new(source, params)).collect();
-    sweep_prepared(&reference, &sources.iter().collect::<Vec<_>>(), near, far, params)
+    let sources: Vec<Prepared> = sources
+        .iter()
+        .map(|source| Prepared::new(source, params))
+        .collect();
+    sweep_prepared(
+        &reference,
+        &sources.iter().collect::<Vec<_>>(),
+        near,
+        far,
+        params,
+    )
 }
 
 /// Keeps the depths that at least `params.min_views` of `others` agree with; all other confidences are 0.
-pub fn verify(reference: (&MvsView, &RawDepth), others: &[(&MvsView, &RawDepth)], params: &MvsParams) -> DepthMap {
-    let others: Vec<(Rigid, &RawDepth)> = others.iter().map(|(view, raw)| (view.world_from_cam, *raw)).collect();
+pub fn verify(
+    reference: (&MvsView, &RawDepth),
+    others: &[(&MvsView, &RawDepth)],
+    params: &MvsParams,
+) -> DepthMap {
+    let others: Vec<(Rigid, &RawDepth)> = others
+        .iter()
+        .map(|(view, raw)| (view.world_from_cam, *raw))
+        .collect();
     consistency::verify((reference.0.world_from_cam, reference.1), &others, params)
 }
 
@@ -64,13 +87,22 @@ struct Prepared {
 impl Prepared {
     fn new(view: &MvsView, params: &MvsParams) -> Self {
         let grey = grey::Grey::of_image(&view.image, params);
-        let intrinsics = view.intrinsics.resized(grey.width as u32, grey.height as u32);
-        Self { grey, intrinsics, world_from_cam: view.world_from_cam }
+        let intrinsics = view
+            .intrinsics
+            .resized(grey.width as u32, grey.height as u32);
+        Self {
+            grey,
+            intrinsics,
+            world_from_cam: view.world_from_cam,
+        }
     }
 
     fn is_usable(&self) -> bool {
         let unit = (self.world_from_cam.rotation.length_squared() - 1.0).abs() < 1e-3;
-        self.world_from_cam.is_finite() && unit && self.intrinsics.is_plausible() && self.grey.width >= MIN_SIDE_PX
+        self.world_from_cam.is_finite()
+            && unit
+            && self.intrinsics.is_plausible()
+            && self.grey.width >= MIN_SIDE_PX
             && self.grey.height >= MIN_SIDE_PX
     }
 }
@@ -78,13 +110,23 @@ impl Prepared {
 /// Two matching windows; smaller pictures hold no depth worth having.
 const MIN_SIDE_PX: usize = 2 * sweep::WINDOW;
 
-fn sweep_prepared(reference: &Prepared, sources: &[&Prepared], near: f64, far: f64, params: &MvsParams) -> RawDepth {
+fn sweep_prepared(
+    reference: &Prepared,
+    sources: &[&Prepared],
+    near: f64,
+    far: f64,
+    params: &MvsParams,
+) -> RawDepth {
     let empty = RawDepth::empty(reference.intrinsics);
     let range_fits = near.is_finite() && far.is_finite() && near > 0.0 && far > near * 1.000_1;
     if !range_fits || !reference.is_usable() {
         return empty;
     }
-    let planes = sweep::Planes { inverse_near: 1.0 / near, inverse_far: 1.0 / far, n: params.n_depths.max(3) };
+    let planes = planes::Planes {
+        inverse_near: 1.0 / near,
+        inverse_far: 1.0 / far,
+        n: params.n_depths.max(3),
+    };
     let warps: Vec<sweep::Warp<'_>> = sources
         .iter()
         .filter(|source| source.is_usable())
@@ -96,13 +138,27 @@ fn sweep_prepared(reference: &Prepared, sources: &[&Prepared], near: f64, far: f
     }
     let costs = sweep::matching_costs(&reference.grey, &warps, &planes);
     let winners = sgm::best_planes(&reference.grey, &costs, planes.n);
-    let depth = winners.plane.iter().map(|&plane| planes.depth(plane)).collect();
-    RawDepth { intrinsics: reference.intrinsics, depth, score: winners.score, margin: winners.margin }
+    let depth = winners
+        .plane
+        .iter()
+        .map(|&plane| planes.depth(plane))
+        .collect();
+    RawDepth {
+        intrinsics: reference.intrinsics,
+        depth,
+        score: winners.score,
+        margin: winners.margin,
+    }
 }
 
 impl RawDepth {
     fn empty(intrinsics: Intrinsics) -> Self {
         let n = intrinsics.width_px as usize * intrinsics.height_px as usize;
-        Self { intrinsics, depth: vec![0.0; n], score: vec![0.0; n], margin: vec![0.0; n] }
+        Self {
+            intrinsics,
+            depth: vec![0.0; n],
+            score: vec![0.0; n],
+            margin: vec![0.0; n],
+        }
     }
 }

@@ -40,13 +40,21 @@ pub fn choose_sources(
 ) -> Vec<u32> {
     let stride = landmarks_in_world.len().div_ceil(MAX_LANDMARKS).max(1);
     let landmarks: Vec<DVec3> = landmarks_in_world.iter().copied().step_by(stride).collect();
-    let most_shared = candidates.iter().map(|candidate| candidate.n_shared).max().unwrap_or(0);
+    let most_shared = candidates
+        .iter()
+        .map(|candidate| candidate.n_shared)
+        .max()
+        .unwrap_or(0);
     let mut weighed: Vec<(f64, u32)> = candidates
         .iter()
         .filter_map(|candidate| {
             let weight = weight(reference.1, &landmarks, candidate)?;
             // Both views may see a place without both having found it: the count alone is too strict.
-            let shared = if most_shared > 0 { candidate.n_shared as f64 / most_shared as f64 } else { 1.0 };
+            let shared = if most_shared > 0 {
+                candidate.n_shared as f64 / most_shared as f64
+            } else {
+                1.0
+            };
             Some((weight * (0.2 + 0.8 * shared), candidate.keyframe_id))
         })
         .collect();
@@ -57,7 +65,11 @@ pub fn choose_sources(
 
 /// Near and far plane of a sweep from the z-depths of landmarks; `None` with too few of them.
 pub fn depth_range(depths: &[f64]) -> Option<(f64, f64)> {
-    let mut sorted: Vec<f64> = depths.iter().copied().filter(|depth| depth.is_finite() && *depth > 0.0).collect();
+    let mut sorted: Vec<f64> = depths
+        .iter()
+        .copied()
+        .filter(|depth| depth.is_finite() && *depth > 0.0)
+        .collect();
     if sorted.len() < MIN_LANDMARKS {
         return None;
     }
@@ -70,19 +82,30 @@ pub fn depth_range(depths: &[f64]) -> Option<(f64, f64)> {
 /// `None`: no use as a source.
 fn weight(reference: &Rigid, landmarks: &[DVec3], candidate: &Candidate) -> Option<f64> {
     let pose = &candidate.world_from_cam;
-    if !pose.is_finite() || !reference.is_finite() || !candidate.intrinsics.is_plausible() || landmarks.is_empty() {
+    if !pose.is_finite()
+        || !reference.is_finite()
+        || !candidate.intrinsics.is_plausible()
+        || landmarks.is_empty()
+    {
         return None;
     }
     let cam_from_world = pose.inverse();
-    let (width, height) = (f64::from(candidate.intrinsics.width_px), f64::from(candidate.intrinsics.height_px));
+    let (width, height) = (
+        f64::from(candidate.intrinsics.width_px),
+        f64::from(candidate.intrinsics.height_px),
+    );
     let mut angles: Vec<f64> = landmarks
         .iter()
         .filter(|landmark| {
-            let pixel = candidate.intrinsics.project(cam_from_world.transform_point(**landmark));
+            let pixel = candidate
+                .intrinsics
+                .project(cam_from_world.transform_point(**landmark));
             pixel.is_some_and(|p| p.x >= 0.0 && p.y >= 0.0 && p.x < width && p.y < height)
         })
         .map(|&landmark| {
-            (landmark - reference.translation).angle_between(landmark - pose.translation).to_degrees()
+            (landmark - reference.translation)
+                .angle_between(landmark - pose.translation)
+                .to_degrees()
         })
         .filter(|angle| angle.is_finite())
         .collect();

@@ -29,28 +29,46 @@ pub(super) fn best_planes(grey: &Grey, costs: &[u8], n_planes: usize) -> Winners
     let row_cells = width * n_planes;
     let mut down = vec![0_u16; costs.len()];
     let mut up = vec![0_u16; costs.len()];
-    down.par_chunks_mut(row_cells).enumerate().for_each(|(y, sums)| {
-        along_row(grey.row(y), &costs[y * row_cells..(y + 1) * row_cells], n_planes, sums);
-    });
+    down.par_chunks_mut(row_cells)
+        .enumerate()
+        .for_each(|(y, sums)| {
+            along_row(
+                grey.row(y),
+                &costs[y * row_cells..(y + 1) * row_cells],
+                n_planes,
+                sums,
+            );
+        });
     rayon::join(
         || across_rows(grey, costs, n_planes, &mut down, |step| step),
         || across_rows(grey, costs, n_planes, &mut up, |step| height - 1 - step),
     );
     let n_pixels = width * height;
-    let mut winners = Winners { plane: vec![-1.0; n_pixels], score: vec![0.0; n_pixels], margin: vec![0.0; n_pixels] };
-    let rows = winners.plane.par_chunks_mut(width).zip(winners.score.par_chunks_mut(width));
-    rows.zip(winners.margin.par_chunks_mut(width)).enumerate().for_each(|(y, ((plane, score), margin))| {
-        let mut total = vec![0_u16; n_planes];
-        for x in 0..width {
-            let at = (y * width + x) * n_planes..(y * width + x + 1) * n_planes;
-            add_into(&mut total, &down[at.clone()], &up[at.clone()]);
-            let Some(winner) = winner_of(&total) else { continue };
-            let cost = costs[at.start + winner.plane];
-            plane[x] = winner.plane as f32 + winner.offset;
-            score[x] = 1.0 - f32::from(cost) / 255.0;
-            margin[x] = winner.margin;
-        }
-    });
+    let mut winners = Winners {
+        plane: vec![-1.0; n_pixels],
+        score: vec![0.0; n_pixels],
+        margin: vec![0.0; n_pixels],
+    };
+    let rows = winners
+        .plane
+        .par_chunks_mut(width)
+        .zip(winners.score.par_chunks_mut(width));
+    rows.zip(winners.margin.par_chunks_mut(width))
+        .enumerate()
+        .for_each(|(y, ((plane, score), margin))| {
+            let mut total = vec![0_u16; n_planes];
+            for x in 0..width {
+                let at = (y * width + x) * n_planes..(y * width + x + 1) * n_planes;
+                add_into(&mut total, &down[at.clone()], &up[at.clone()]);
+                let Some(winner) = winner_of(&total) else {
+                    continue;
+                };
+                let cost = costs[at.start + winner.plane];
+                plane[x] = winner.plane as f32 + winner.offset;
+                score[x] = 1.0 - f32::from(cost) / 255.0;
+                margin[x] = winner.margin;
+            }
+        });
     winners
 }
 
@@ -74,12 +92,28 @@ fn winner_of(total: &[u16]) -> Option<Winner> {
     if plane == 0 || plane + 1 == total.len() {
         return None;
     }
-    let (before, at, after) = (f32::from(total[plane - 1]), f32::from(lowest), f32::from(total[plane + 1]));
+    let (before, at, after) = (
+        f32::from(total[plane - 1]),
+        f32::from(lowest),
+        f32::from(total[plane + 1]),
+    );
     let curvature = before + after - 2.0 * at;
-    let offset = if curvature > 0.0 { 0.5 * (before - after) / curvature } else { 0.0 };
+    let offset = if curvature > 0.0 {
+        0.5 * (before - after) / curvature
+    } else {
+        0.0
+    };
     let second = lowest_of(&total[..plane - 1]).min(lowest_of(&total[plane + 2..]));
-    let margin = if second == u16::MAX { 0.0 } else { (f32::from(second) - at) / f32::from(second).max(1.0) };
-    Some(Winner { plane, offset: offset.clamp(-0.5, 0.5), margin })
+    let margin = if second == u16::MAX {
+        0.0
+    } else {
+        (f32::from(second) - at) / f32::from(second).max(1.0)
+    };
+    Some(Winner {
+        plane,
+        offset: offset.clamp(-0.5, 0.5),
+        margin,
+    })
 }
 
 fn jump_penalty(luma: f32, previous: f32) -> u16 {
@@ -125,10 +159,25 @@ fn along_row(luma: &[f32], costs: &[u8], n_planes: usize, sums: &mut [u16]) {
 }
 
 /// The straight and the two slanted paths from row to row, in the order of `row_of`; adds to `sums`.
-fn across_rows(grey: &Grey, costs: &[u8], n_planes: usize, sums: &mut [u16], row_of: impl Fn(usize) -> usize) {
+fn across_rows(
+    grey: &Grey,
+    costs: &[u8],
+    n_planes: usize,
+    sums: &mut [u16],
+    row_of: impl Fn(usize) -> usize,
+) {
     let (width, height) = (grey.width, grey.height);
     // Path k of pixel x came from column x + k - 1 of the row before; one column of border on both sides.
-    let fresh = || vec![[Path::new(n_planes), Path::new(n_planes), Path::new(n_planes)]; width + 2];
+    let fresh = || {
+        vec![
+            [
+                Path::new(n_planes),
+                Path::new(n_planes),
+                Path::new(n_planes)
+            ];
+            width + 2
+        ]
+    };
     let (mut paths, mut next) = (fresh(), fresh());
     for step in 0..height {
         let y = row_of(step);
@@ -139,7 +188,13 @@ fn across_rows(grey: &Grey, costs: &[u8], n_planes: usize, sums: &mut [u16], row
             for k in 0..3 {
                 let from = (x + k).saturating_sub(1).min(width - 1);
                 let penalty = jump_penalty(luma[x], luma_before[from]);
-                follow(&paths[x + k][k], &mut next[x + 1][k], &costs[at.clone()], penalty, &mut sums[at.clone()]);
+                follow(
+                    &paths[x + k][k],
+                    &mut next[x + 1][k],
+                    &costs[at.clone()],
+                    penalty,
+                    &mut sums[at.clone()],
+                );
             }
         }
         std::mem::swap(&mut paths, &mut next);
@@ -151,7 +206,11 @@ fn across_rows(grey: &Grey, costs: &[u8], n_planes: usize, sums: &mut [u16], row
 fn follow(path: &Path, next: &mut Path, costs: &[u8], jump: u16, sums: &mut [u16]) {
     let n = costs.len();
     let sums = &mut sums[..n];
-    let (before, same, after) = (&path.costs[..n], &path.costs[1..n + 1], &path.costs[2..n + 2]);
+    let (before, same, after) = (
+        &path.costs[..n],
+        &path.costs[1..n + 1],
+        &path.costs[2..n + 2],
+    );
     let into = &mut next.costs[1..n + 1];
     let floor = path.lowest;
     let ceiling = floor + jump;

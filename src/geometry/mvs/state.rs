@@ -46,32 +46,58 @@ const MAX_LANDMARKS: usize = 200;
 
 impl MvsState {
     pub fn new(params: MvsParams, max_keyframes: usize) -> Self {
-        Self { params, max_keyframes: max_keyframes.max(1), held: BTreeMap::new(), n_sweeps: 0 }
+        Self {
+            params,
+            max_keyframes: max_keyframes.max(1),
+            held: BTreeMap::new(),
+            n_sweeps: 0,
+        }
     }
 
     /// Matches `view` against those `neighbours` that are held. Without any, the view is held all the same and can
     /// serve as a source. An id that is held already is replaced. The oldest keyframe leaves when there are too many.
-    pub fn add(&mut self, keyframe_id: u32, view: &MvsView, near: f64, far: f64, neighbours: &[u32]) {
+    pub fn add(
+        &mut self,
+        keyframe_id: u32,
+        view: &MvsView,
+        near: f64,
+        far: f64,
+        neighbours: &[u32],
+    ) {
         let prepared = Prepared::new(view, &self.params);
         let raw = RawDepth::empty(prepared.intrinsics);
         let swept_intrinsics = prepared.intrinsics;
         self.n_sweeps += 1;
-        let held = Held { prepared, raw, swept_intrinsics, sources: Vec::new(), age: self.n_sweeps };
+        let held = Held {
+            prepared,
+            raw,
+            swept_intrinsics,
+            sources: Vec::new(),
+            age: self.n_sweeps,
+        };
         self.held.insert(keyframe_id, held);
         self.resweep(keyframe_id, near, far, neighbours);
         while self.held.len() > self.max_keyframes {
-            let oldest = self.held.iter().min_by_key(|(_, held)| held.age).map(|(id, _)| *id);
+            let oldest = self
+                .held
+                .iter()
+                .min_by_key(|(_, held)| held.age)
+                .map(|(id, _)| *id);
             oldest.and_then(|id| self.held.remove(&id));
         }
     }
 
     /// Matches a held keyframe again, with the poses of this moment. Does nothing for an id that is not held.
     pub fn resweep(&mut self, keyframe_id: u32, near: f64, far: f64, neighbours: &[u32]) {
-        let Some(held) = self.held.get(&keyframe_id) else { return };
+        let Some(held) = self.held.get(&keyframe_id) else {
+            return;
+        };
         let reference = &held.prepared;
         let usable = neighbours.iter().filter(|id| **id != keyframe_id);
-        let sources: Vec<(u32, &Prepared)> =
-            usable.filter_map(|id| Some((*id, &self.held.get(id)?.prepared))).take(self.params.n_sources).collect();
+        let sources: Vec<(u32, &Prepared)> = usable
+            .filter_map(|id| Some((*id, &self.held.get(id)?.prepared)))
+            .take(self.params.n_sources)
+            .collect();
         let pictures: Vec<&Prepared> = sources.iter().map(|(_, prepared)| *prepared).collect();
         let raw = sweep_prepared(reference, &pictures, near, far, &self.params);
         let sources = sources
@@ -99,8 +125,13 @@ impl MvsState {
             .filter_map(|id| self.held.get(id))
             .map(|other| (other.prepared.world_from_cam, self.current(other)))
             .collect();
-        let others: Vec<(Rigid, &RawDepth)> = others.iter().map(|(pose, raw)| (*pose, raw)).collect();
-        Some(consistency::verify((held.prepared.world_from_cam, &raw), &others, &self.params))
+        let others: Vec<(Rigid, &RawDepth)> =
+            others.iter().map(|(pose, raw)| (*pose, raw)).collect();
+        Some(consistency::verify(
+            (held.prepared.world_from_cam, &raw),
+            &others,
+            &self.params,
+        ))
     }
 
     /// A better camera. Depth already matched follows a change of scale; see `drift_px` for the rest.
@@ -117,19 +148,34 @@ impl MvsState {
     pub fn drift_px(&self, keyframe_id: u32) -> Option<f64> {
         let held = self.held.get(&keyframe_id)?;
         let scale = self.scale_since_sweep(held);
-        let depth = f64::from(median(held.raw.depth.iter().copied().filter(|depth| *depth > 0.0))?);
-        let (width, height) = (held.prepared.grey.width as f64, held.prepared.grey.height as f64);
+        let depth = f64::from(median(
+            held.raw.depth.iter().copied().filter(|depth| *depth > 0.0),
+        )?);
+        let (width, height) = (
+            held.prepared.grey.width as f64,
+            held.prepared.grey.height as f64,
+        );
         let mut worst: Option<f64> = None;
         for source in &held.sources {
-            let Some(other) = self.held.get(&source.keyframe_id) else { continue };
-            let source_from_cam = other.prepared.world_from_cam.inverse() * held.prepared.world_from_cam;
+            let Some(other) = self.held.get(&source.keyframe_id) else {
+                continue;
+            };
+            let source_from_cam =
+                other.prepared.world_from_cam.inverse() * held.prepared.world_from_cam;
             for (share_x, share_y) in [(0.5, 0.5), (0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8)] {
                 let pixel = DVec2::new(share_x * width, share_y * height);
                 let before = held.swept_intrinsics.ray_in_cam(pixel) * depth;
                 let after = held.prepared.intrinsics.ray_in_cam(pixel) * depth * scale;
-                let before = source.intrinsics.project(source.source_from_cam.transform_point(before));
-                let after = other.prepared.intrinsics.project(source_from_cam.transform_point(after));
-                let (Some(before), Some(after)) = (before, after) else { continue };
+                let before = source
+                    .intrinsics
+                    .project(source.source_from_cam.transform_point(before));
+                let after = other
+                    .prepared
+                    .intrinsics
+                    .project(source_from_cam.transform_point(after));
+                let (Some(before), Some(after)) = (before, after) else {
+                    continue;
+                };
                 worst = Some(worst.unwrap_or(0.0).max((after - before).length()));
             }
         }
@@ -153,7 +199,9 @@ impl MvsState {
     fn scale_since_sweep(&self, held: &Held) -> f64 {
         let ratios = held.sources.iter().filter_map(|source| {
             let other = &self.held.get(&source.keyframe_id)?.prepared;
-            let distance = (other.world_from_cam.translation - held.prepared.world_from_cam.translation).length();
+            let distance = (other.world_from_cam.translation
+                - held.prepared.world_from_cam.translation)
+                .length();
             let ratio = distance / source.source_from_cam.translation.length();
             (ratio.is_finite() && ratio > 0.0).then_some(ratio)
         });
@@ -162,7 +210,9 @@ impl MvsState {
 
     fn verifiers_of(&self, keyframe_id: u32, held: &Held, raw: &RawDepth) -> Vec<u32> {
         let width = held.prepared.grey.width;
-        let found: Vec<usize> = (0..raw.depth.len()).filter(|ix| raw.depth[*ix] > 0.0).collect();
+        let found: Vec<usize> = (0..raw.depth.len())
+            .filter(|ix| raw.depth[*ix] > 0.0)
+            .collect();
         let stride = found.len().div_ceil(MAX_LANDMARKS).max(1);
         let landmarks: Vec<DVec3> = found
             .iter()
@@ -184,7 +234,12 @@ impl MvsState {
                 n_shared: 0,
             })
             .collect();
-        choose_sources((&raw.intrinsics, &held.prepared.world_from_cam), &landmarks, &candidates, MAX_VERIFIERS)
+        choose_sources(
+            (&raw.intrinsics, &held.prepared.world_from_cam),
+            &landmarks,
+            &candidates,
+            MAX_VERIFIERS,
+        )
     }
 }
 

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use super::Prepared;
 use super::grey::Grey;
+use super::planes::Planes;
 
 /// Side of the matching window in pixels.
 pub(super) const WINDOW: usize = 7;
@@ -26,25 +27,6 @@ const MIN_ANGLE_RAD: f64 = 0.008;
 /// Below this way across the source picture, from the near to the far plane, there is nothing to tell planes apart.
 const MIN_TRAVEL_PX: f64 = 1.5;
 
-/// Planes evenly spaced in inverse depth; plane 0 is the far one.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Planes {
-    pub(super) inverse_near: f64,
-    pub(super) inverse_far: f64,
-    pub(super) n: usize,
-}
-
-impl Planes {
-    pub(super) fn inverse_depth(&self, plane: f64) -> f64 {
-        self.inverse_far + (self.inverse_near - self.inverse_far) * plane / (self.n - 1) as f64
-    }
-
-    /// Depth of a fractional plane number; negative = no plane = 0.
-    pub(super) fn depth(&self, plane: f32) -> f32 {
-        if plane < 0.0 { 0.0 } else { (1.0 / self.inverse_depth(f64::from(plane))) as f32 }
-    }
-}
-
 /// The way from reference pixels to source pixels: `pixel_map * (x, y, 1) + inverse_depth * shift`, homogeneous.
 #[derive(Debug)]
 pub(super) struct Warp<'a> {
@@ -61,7 +43,13 @@ impl<'a> Warp<'a> {
         let rotation = source_from_reference.rotation_matrix();
         let (from, to) = (&reference.intrinsics, &source.intrinsics);
         // Half a pixel less on the way out, half a pixel more on the way in.
-        let project = |p: glam::DVec3| [to.fx * p.x + (to.cx - 0.5) * p.z, to.fy * p.y + (to.cy - 0.5) * p.z, p.z];
+        let project = |p: glam::DVec3| {
+            [
+                to.fx * p.x + (to.cx - 0.5) * p.z,
+                to.fy * p.y + (to.cy - 0.5) * p.z,
+                p.z,
+            ]
+        };
         let corner = glam::DVec3::new((0.5 - from.cx) / from.fx, (0.5 - from.cy) / from.fy, 1.0);
         let warp = Self {
             source: &source.grey,
@@ -74,7 +62,8 @@ impl<'a> Warp<'a> {
         };
         let middle = 0.5 * (planes.inverse_near + planes.inverse_far);
         let angle = source_from_reference.translation.length() * middle;
-        (angle >= MIN_ANGLE_RAD && warp.travel_px(reference, planes) >= MIN_TRAVEL_PX).then_some(warp)
+        (angle >= MIN_ANGLE_RAD && warp.travel_px(reference, planes) >= MIN_TRAVEL_PX)
+            .then_some(warp)
     }
 
     /// Longest way of a few test pixels across the source, from the far to the near plane; 0 where both miss it.
@@ -97,7 +86,10 @@ impl<'a> Warp<'a> {
 
     fn homogeneous(&self, x: f64, y: f64, inverse_depth: f64) -> glam::DVec3 {
         let column = |ix: usize| glam::DVec3::from_array(self.pixel_map[ix]);
-        column(0) * x + column(1) * y + column(2) + glam::DVec3::from_array(self.shift) * inverse_depth
+        column(0) * x
+            + column(1) * y
+            + column(2)
+            + glam::DVec3::from_array(self.shift) * inverse_depth
     }
 
     fn pixel_in_source(&self, x: f64, y: f64, inverse_depth: f64) -> Option<glam::DVec2> {
@@ -107,8 +99,13 @@ impl<'a> Warp<'a> {
 
     fn row(&self, y: usize, inverse_depth: f64) -> WarpedRow {
         WarpedRow {
-            start: self.homogeneous(0.0, y as f64, inverse_depth).as_vec3().to_array(),
-            step: glam::DVec3::from_array(self.pixel_map[0]).as_vec3().to_array(),
+            start: self
+                .homogeneous(0.0, y as f64, inverse_depth)
+                .as_vec3()
+                .to_array(),
+            step: glam::DVec3::from_array(self.pixel_map[0])
+                .as_vec3()
+                .to_array(),
         }
     }
 }
@@ -124,19 +121,31 @@ pub(super) fn matching_costs(reference: &Grey, warps: &[Warp<'_>], planes: &Plan
     let n_pixels = reference.width * reference.height;
     let statistics = Statistics::of(reference);
     let mut by_plane = vec![0_u8; planes.n * n_pixels];
-    by_plane.par_chunks_mut(n_pixels).enumerate().for_each(|(plane, costs)| {
-        plane_costs(reference, &statistics, warps, planes.inverse_depth(plane as f64), costs);
-    });
+    by_plane
+        .par_chunks_mut(n_pixels)
+        .enumerate()
+        .for_each(|(plane, costs)| {
+            plane_costs(
+                reference,
+                &statistics,
+                warps,
+                planes.inverse_depth(plane as f64),
+                costs,
+            );
+        });
     let mut costs = vec![0_u8; planes.n * n_pixels];
     let (width, n_planes) = (reference.width, planes.n);
-    costs.par_chunks_mut(width * n_planes).enumerate().for_each(|(y, row)| {
-        for plane in 0..n_planes {
-            let from = &by_plane[plane * n_pixels + y * width..][..width];
-            for (into, &cost) in row[plane..].iter_mut().step_by(n_planes).zip(from) {
-                *into = cost;
+    costs
+        .par_chunks_mut(width * n_planes)
+        .enumerate()
+        .for_each(|(y, row)| {
+            for plane in 0..n_planes {
+                let from = &by_plane[plane * n_pixels + y * width..][..width];
+                for (into, &cost) in row[plane..].iter_mut().step_by(n_planes).zip(from) {
+                    *into = cost;
+                }
             }
-        }
-    });
+        });
     costs
 }
 
@@ -151,7 +160,11 @@ struct Statistics {
 impl Statistics {
     fn of(grey: &Grey) -> Self {
         let n_pixels = grey.values.len();
-        let mut all = Self { sum: vec![0.0; n_pixels], spread: vec![0.0; n_pixels], one_over_n: vec![0.0; n_pixels] };
+        let mut all = Self {
+            sum: vec![0.0; n_pixels],
+            spread: vec![0.0; n_pixels],
+            one_over_n: vec![0.0; n_pixels],
+        };
         for y in 0..grey.height {
             let rows = y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(grey.height);
             for x in 0..grey.width {
@@ -181,27 +194,53 @@ struct Ring {
     seen: Vec<f32>,
 }
 
-fn plane_costs(reference: &Grey, statistics: &Statistics, warps: &[Warp<'_>], inverse_depth: f64, costs: &mut [u8]) {
+fn plane_costs(
+    reference: &Grey,
+    statistics: &Statistics,
+    warps: &[Warp<'_>],
+    inverse_depth: f64,
+    costs: &mut [u8],
+) {
     let (width, height) = (reference.width, reference.height);
-    let mut rings: Vec<Ring> =
-        warps.iter().map(|_| Ring { values: vec![0.0; WINDOW * width], seen: vec![0.0; WINDOW * width] }).collect();
+    let mut rings: Vec<Ring> = warps
+        .iter()
+        .map(|_| Ring {
+            values: vec![0.0; WINDOW * width],
+            seen: vec![0.0; WINDOW * width],
+        })
+        .collect();
     let mut scratch = Scratch::new(width);
     for y in 0..height + RADIUS {
         if y < height {
             for (warp, ring) in warps.iter().zip(&mut rings) {
                 let slot = (y % WINDOW) * width;
-                let (values, seen) = (&mut ring.values[slot..slot + width], &mut ring.seen[slot..slot + width]);
-                warp_row(warp, &warp.row(y, inverse_depth), &mut scratch, values, seen);
+                let (values, seen) = (
+                    &mut ring.values[slot..slot + width],
+                    &mut ring.seen[slot..slot + width],
+                );
+                warp_row(
+                    warp,
+                    &warp.row(y, inverse_depth),
+                    &mut scratch,
+                    values,
+                    seen,
+                );
             }
         }
-        let Some(centre) = y.checked_sub(RADIUS) else { continue };
+        let Some(centre) = y.checked_sub(RADIUS) else {
+            continue;
+        };
         let window_rows = centre.saturating_sub(RADIUS)..(centre + RADIUS + 1).min(height);
         let at = centre * width..(centre + 1) * width;
         scratch.best.fill(-1.0);
         scratch.second.fill(-1.0);
         for ring in &rings {
             column_sums(reference, ring, window_rows.clone(), &mut scratch);
-            let of_reference = [&statistics.sum[at.clone()], &statistics.spread[at.clone()], &statistics.one_over_n[at.clone()]];
+            let of_reference = [
+                &statistics.sum[at.clone()],
+                &statistics.spread[at.clone()],
+                &statistics.one_over_n[at.clone()],
+            ];
             let slot = (centre % WINDOW) * width;
             window_zncc(of_reference, &ring.seen[slot..slot + width], &mut scratch);
         }
@@ -236,12 +275,22 @@ impl Scratch {
 }
 
 #[multiversion(targets("x86_64+avx2"))]
-fn warp_row(warp: &Warp<'_>, row: &WarpedRow, scratch: &mut Scratch, values: &mut [f32], seen: &mut [f32]) {
+fn warp_row(
+    warp: &Warp<'_>,
+    row: &WarpedRow,
+    scratch: &mut Scratch,
+    values: &mut [f32],
+    seen: &mut [f32],
+) {
     let n = values.len();
     let (width, height) = (warp.source.width, warp.source.height);
     let (last_x, last_y) = ((width - 1) as f32, (height - 1) as f32);
     let (cell_x, cell_y) = ((width - 2) as f32, (height - 2) as f32);
-    let (index, share_x, share_y) = (&mut scratch.index[..n], &mut scratch.share_x[..n], &mut scratch.share_y[..n]);
+    let (index, share_x, share_y) = (
+        &mut scratch.index[..n],
+        &mut scratch.share_x[..n],
+        &mut scratch.share_y[..n],
+    );
     let seen = &mut seen[..n];
     for x in 0..n {
         let along = x as f32;
@@ -250,7 +299,8 @@ fn warp_row(warp: &Warp<'_>, row: &WarpedRow, scratch: &mut Scratch, values: &mu
         let u = (row.start[0] + along * row.step[0]) * over;
         let v = (row.start[1] + along * row.step[1]) * over;
         // Half a pixel beyond the outermost centres still belongs to the picture.
-        let inside = (depth > 1e-6) & (u >= -0.5) & (v >= -0.5) & (u <= last_x + 0.5) & (v <= last_y + 0.5);
+        let inside =
+            (depth > 1e-6) & (u >= -0.5) & (v >= -0.5) & (u <= last_x + 0.5) & (v <= last_y + 0.5);
         seen[x] = if inside { 1.0 } else { 0.0 };
         let u = u.max(0.0).min(last_x);
         let v = v.max(0.0).min(last_y);
@@ -317,8 +367,16 @@ fn window_zncc(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch) {
 #[multiversion(targets("x86_64+avx2"))]
 fn mean_costs(best: &[f32], second: &[f32], costs: &mut [u8]) {
     for ((&best, &second), cost) in best.iter().zip(second).zip(costs) {
-        let second = if second > -1.0 { second } else { best.min(UNSEEN_ZNCC) };
-        let zncc = if best > -1.0 { 0.5 * (best + second) } else { UNSEEN_ZNCC };
+        let second = if second > -1.0 {
+            second
+        } else {
+            best.min(UNSEEN_ZNCC)
+        };
+        let zncc = if best > -1.0 {
+            0.5 * (best + second)
+        } else {
+            UNSEEN_ZNCC
+        };
         *cost = ((1.0 - zncc.max(0.0)) * 255.0 + 0.5) as u8;
     }
 }

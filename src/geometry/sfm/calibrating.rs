@@ -24,7 +24,12 @@ pub(super) fn current_share(scene: &Scene) -> Option<f64> {
 }
 
 /// Starts the first component of uncalibrated shots: view-graph focal length first, then a few others if that is poor.
-pub(super) fn start_uncalibrated(scene: &mut Scene, pool: &[usize], guess: Option<f64>, limits: &Limits) -> Start {
+pub(super) fn start_uncalibrated(
+    scene: &mut Scene,
+    pool: &[usize],
+    guess: Option<f64>,
+    limits: &Limits,
+) -> Start {
     let needed = pool.len().min(3);
     let first = guess.or_else(|| estimate(scene, limits));
     let choices: Vec<f64> = first.into_iter().chain(RESTARTS).collect();
@@ -36,7 +41,13 @@ pub(super) fn start_uncalibrated(scene: &mut Scene, pool: &[usize], guess: Optio
         if matches!(outcome, Start::NoMatches) {
             return outcome;
         }
-        let Some(component) = scene.components.last().filter(|_| outcome == Start::Started) else { continue };
+        let Some(component) = scene
+            .components
+            .last()
+            .filter(|_| outcome == Start::Started)
+        else {
+            continue;
+        };
         let n = component.shots.len() as f64;
         let error = median_error_px(scene, &component.shots);
         if error <= GOOD_ERROR * limits.max_error_px && n >= GOOD_SHARE * pool.len() as f64 {
@@ -50,7 +61,9 @@ pub(super) fn start_uncalibrated(scene: &mut Scene, pool: &[usize], guess: Optio
         let last = scene.components.len() as u32 - 1;
         scene.dissolve(last);
     }
-    let Some((_, share)) = best else { return outcome };
+    let Some((_, share)) = best else {
+        return outcome;
+    };
     set_share(scene, share);
     start(scene, pool, needed, limits)
 }
@@ -79,14 +92,23 @@ fn estimate(scene: &Scene, limits: &Limits) -> Option<f64> {
         }
         let pixels = pixel_pairs(first, second, &link.matches);
         let plane = homography_share(&pixels, limits.max_error_px, pair_seed(limits.seed, *a, *b));
-        let Some(f) = eight_point(&pixels) else { continue };
+        let Some(f) = eight_point(&pixels) else {
+            continue;
+        };
         let centre = |s: &super::scene::Shot| glam::DVec2::new(s.lens.cx, s.lens.cy);
         let fundamental = centred(&f, centre(first), centre(second));
         let weight = (1.0 - plane).max(0.0) * (link.matches.len() as f64).sqrt();
-        pairs.push(PairView { fundamental, weight });
+        pairs.push(PairView {
+            fundamental,
+            weight,
+        });
         longest = f64::from(first.lens.width_px.max(first.lens.height_px));
     }
     let found = focal_share(&pairs, longest);
-    tracing::debug!(n_pairs = pairs.len(), ?found, "focal length from the view graph");
+    tracing::debug!(
+        n_pairs = pairs.len(),
+        ?found,
+        "focal length from the view graph"
+    );
     found
 }

@@ -56,7 +56,12 @@ impl Densifier {
             self.sweep(view);
         }
         let views = sparse.views.iter().map(|view| self.view(view)).collect();
-        GeometryBatch { batch_id: sparse.batch_id, views, revised: sparse.revised, note: sparse.note }
+        GeometryBatch {
+            batch_id: sparse.batch_id,
+            views,
+            revised: sparse.revised,
+            note: sparse.note,
+        }
     }
 
     fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
@@ -65,7 +70,17 @@ impl Densifier {
         if self.state.holds(id) {
             self.state.revise(id, view.intrinsics, world_from_cam);
         } else if let Some(image) = image_of(id) {
-            self.state.add(id, &MvsView { image, intrinsics: view.intrinsics, world_from_cam }, 1.0, 2.0, &[]);
+            self.state.add(
+                id,
+                &MvsView {
+                    image,
+                    intrinsics: view.intrinsics,
+                    world_from_cam,
+                },
+                1.0,
+                2.0,
+                &[],
+            );
         }
         while self.intrinsics.len() > MAX_HELD {
             self.intrinsics.pop_first();
@@ -76,21 +91,39 @@ impl Densifier {
     /// Sweeps a new view, and one swept before when it had too few sources or its camera has moved.
     fn sweep(&mut self, view: &SparseView) {
         let id = view.keyframe_id;
-        let neighbours: Vec<u32> =
-            view.neighbours.iter().map(|n| n.keyframe_id).filter(|n| self.state.holds(*n)).collect();
+        let neighbours: Vec<u32> = view
+            .neighbours
+            .iter()
+            .map(|n| n.keyframe_id)
+            .filter(|n| self.state.holds(*n))
+            .collect();
         let n_sources = neighbours.len().min(self.params.n_sources);
         let is_current = self.n_sources.get(&id).is_some_and(|had| *had >= n_sources)
-            && self.state.drift_px(id).is_none_or(|drift| drift <= MAX_DRIFT_PX);
+            && self
+                .state
+                .drift_px(id)
+                .is_none_or(|drift| drift <= MAX_DRIFT_PX);
         let cam_from_batch = view.batch_from_cam.inverse();
-        let depths: Vec<f64> =
-            view.landmarks.iter().map(|l| cam_from_batch.transform_point(l.point_in_batch).z).collect();
-        let Some((near, far)) = depth_range(&depths).filter(|_| !is_current && n_sources > 0) else { return };
+        let depths: Vec<f64> = view
+            .landmarks
+            .iter()
+            .map(|l| cam_from_batch.transform_point(l.point_in_batch).z)
+            .collect();
+        let Some((near, far)) = depth_range(&depths).filter(|_| !is_current && n_sources > 0)
+        else {
+            return;
+        };
         self.state.resweep(id, near, far, &neighbours);
         self.n_sources.insert(id, n_sources);
     }
 
     fn view(&self, view: &SparseView) -> View {
-        let none = || DepthMap { width_px: 0, height_px: 0, depth: Vec::new(), confidence: Vec::new() };
+        let none = || DepthMap {
+            width_px: 0,
+            height_px: 0,
+            depth: Vec::new(),
+            confidence: Vec::new(),
+        };
         View {
             keyframe_id: view.keyframe_id,
             component: view.component,

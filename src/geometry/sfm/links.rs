@@ -25,13 +25,19 @@ const MIN_LINK: usize = 15;
 pub(super) fn signature(features: &Features) -> Wide {
     let mut order: Vec<usize> = (0..features.len()).collect();
     order.sort_by(|&a, &b| features.sigmas[b].total_cmp(&features.sigmas[a]));
-    let picked: Vec<_> = order.iter().take(SIGNATURE).map(|&i| features.descriptors[i]).collect();
+    let picked: Vec<_> = order
+        .iter()
+        .take(SIGNATURE)
+        .map(|&i| features.descriptors[i])
+        .collect();
     Wide::new(&picked)
 }
 
 /// Links the newest shot (the last) to earlier ones.
 pub(super) fn link_newest(scene: &mut Scene, max_error_px: f64, seed: u64) {
-    let Some(newest) = scene.shots.len().checked_sub(1) else { return };
+    let Some(newest) = scene.shots.len().checked_sub(1) else {
+        return;
+    };
     let recent = newest.saturating_sub(N_RECENT);
     let mut others = alike(scene, newest, recent);
     others.extend(recent..newest);
@@ -53,7 +59,10 @@ pub(super) fn link_alike(scene: &mut Scene, shot_ix: usize, max_error_px: f64, s
 /// Of the first `pool` shots, those whose signatures match best.
 fn alike(scene: &Scene, shot_ix: usize, pool: usize) -> Vec<usize> {
     let stride = pool.div_ceil(MAX_ASKED).max(1);
-    let asked: Vec<usize> = (0..pool).step_by(stride).filter(|&o| o != shot_ix).collect();
+    let asked: Vec<usize> = (0..pool)
+        .step_by(stride)
+        .filter(|&o| o != shot_ix)
+        .collect();
     let own = &scene.shots[shot_ix].signature;
     let votes = |&o: &usize| (matches(own, &scene.shots[o].signature).len(), o);
     let mut ranked: Vec<(usize, usize)> = asked.par_iter().map(votes).collect();
@@ -86,22 +95,33 @@ fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, 
         }
         let flipped = other > shot_ix;
         let link = if flipped { reversed(&link) } else { link };
-        scene.links.insert((other.min(shot_ix), other.max(shot_ix)), link);
+        scene
+            .links
+            .insert((other.min(shot_ix), other.max(shot_ix)), link);
     }
 }
 
 fn reversed(link: &Link) -> Link {
     let matches = link.matches.iter().map(|&(a, b)| (b, a)).collect();
-    Link { matches, motion: link.motion.map(|(pose, parallax)| (pose.inverse(), parallax)) }
+    Link {
+        matches,
+        motion: link
+            .motion
+            .map(|(pose, parallax)| (pose.inverse(), parallax)),
+    }
 }
 
 pub(super) fn pair_seed(seed: u64, a: usize, b: usize) -> u64 {
-    seed ^ (a as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (b as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
+    seed ^ (a as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+        ^ (b as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
 }
 
 /// Pixel pairs of matches between two shots.
 pub(super) fn pixel_pairs(a: &Shot, b: &Shot, matches: &[(u32, u32)]) -> Vec<(DVec2, DVec2)> {
-    matches.iter().map(|&(i, j)| (a.features.pixels[i as usize], b.features.pixels[j as usize])).collect()
+    matches
+        .iter()
+        .map(|&(i, j)| (a.features.pixels[i as usize], b.features.pixels[j as usize]))
+        .collect()
 }
 
 fn verified(
@@ -117,7 +137,10 @@ fn verified(
     let pairs = pixel_pairs(a, b, raw);
     let (inliers, motion) = if focal_known || (a.is_calibrated && b.is_calibrated) {
         let found = motion(&pairs, [&a.lens, &b.lens], max_error_px, seed)?;
-        (found.inliers, Some((found.second_from_first, found.parallax_deg)))
+        (
+            found.inliers,
+            Some((found.second_from_first, found.parallax_deg)),
+        )
     } else {
         (fundamental(&pairs, max_error_px, seed)?.1, None)
     };

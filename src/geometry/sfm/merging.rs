@@ -29,16 +29,21 @@ pub(super) fn merge(scene: &mut Scene, limits: &Limits) -> bool {
 }
 
 fn merge_pair(scene: &mut Scene, stays: u32, gone: u32, limits: &Limits) -> bool {
-    if scene.components[stays as usize].shots.is_empty() || scene.components[gone as usize].shots.is_empty() {
+    if scene.components[stays as usize].shots.is_empty()
+        || scene.components[gone as usize].shots.is_empty()
+    {
         return false;
     }
     let pairs = common_landmarks(scene, stays, gone);
     if pairs.len() < limits.min_inliers {
         return false;
     }
-    let Some((stays_from_gone, inliers)) =
-        similarity(scene, &pairs, limits, pair_seed(limits.seed, stays as usize, gone as usize))
-    else {
+    let Some((stays_from_gone, inliers)) = similarity(
+        scene,
+        &pairs,
+        limits,
+        pair_seed(limits.seed, stays as usize, gone as usize),
+    ) else {
         return false;
     };
     scene.transform(gone, &stays_from_gone);
@@ -54,7 +59,9 @@ fn merge_pair(scene: &mut Scene, stays: u32, gone: u32, limits: &Limits) -> bool
     scene.components[stays as usize].shots.extend(shots);
     for ix in inliers {
         let (a, b) = pairs[ix];
-        if !scene.landmarks[a as usize].seen.is_empty() && !scene.landmarks[b as usize].seen.is_empty() {
+        if !scene.landmarks[a as usize].seen.is_empty()
+            && !scene.landmarks[b as usize].seen.is_empty()
+        {
             join(scene, a, b, 2.0 * limits.max_error_px);
         }
     }
@@ -66,7 +73,12 @@ fn merge_pair(scene: &mut Scene, stays: u32, gone: u32, limits: &Limits) -> bool
 fn common_landmarks(scene: &Scene, a: u32, b: u32) -> Vec<(u32, u32)> {
     let mut votes: BTreeMap<(u32, u32), usize> = BTreeMap::new();
     for &shot in &scene.components[b as usize].shots {
-        for (feature, &landmark) in scene.shots[shot].landmark_of.iter().enumerate().filter(|(_, l)| **l != NONE) {
+        for (feature, &landmark) in scene.shots[shot]
+            .landmark_of
+            .iter()
+            .enumerate()
+            .filter(|(_, l)| **l != NONE)
+        {
             for &(s, f) in &scene.shots[shot].matched[feature] {
                 let other = scene.shots[s as usize].landmark_of[f as usize];
                 if other != NONE && scene.landmarks[other as usize].component == a {
@@ -77,36 +89,61 @@ fn common_landmarks(scene: &Scene, a: u32, b: u32) -> Vec<(u32, u32)> {
     }
     let mut ranked: Vec<((u32, u32), usize)> = votes.into_iter().collect();
     ranked.sort_by(|x, y| y.1.cmp(&x.1).then(x.0.cmp(&y.0)));
-    let (mut taken_a, mut taken_b) = (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
-    ranked
-        .retain(|((l, m), _)| !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m));
+    let (mut taken_a, mut taken_b) = (
+        std::collections::BTreeSet::new(),
+        std::collections::BTreeSet::new(),
+    );
+    ranked.retain(|((l, m), _)| {
+        !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m)
+    });
     ranked.into_iter().map(|r| r.0).collect()
 }
 
 /// RANSAC over three landmarks; a pair agrees when each point projects to the sights of its partner.
-fn similarity(scene: &Scene, pairs: &[(u32, u32)], limits: &Limits, seed: u64) -> Option<(Similarity, Vec<usize>)> {
+fn similarity(
+    scene: &Scene,
+    pairs: &[(u32, u32)],
+    limits: &Limits,
+    seed: u64,
+) -> Option<(Similarity, Vec<usize>)> {
     let point = |l: u32| scene.landmarks[l as usize].point;
     let fits = |s: &Similarity, (a, b): (u32, u32)| {
         let limit = 3.0 * limits.max_error_px;
         let error = |point: DVec3, seen: &[(u32, u32)]| {
-            seen.iter().filter_map(|&at| scene.sight(at)).all(|sight| sight.error_px(point) <= limit)
+            seen.iter()
+                .filter_map(|&at| scene.sight(at))
+                .all(|sight| sight.error_px(point) <= limit)
         };
-        error(s.transform_point(point(b)), &scene.landmarks[a as usize].seen)
-            && error(s.inverse().transform_point(point(a)), &scene.landmarks[b as usize].seen)
+        error(
+            s.transform_point(point(b)),
+            &scene.landmarks[a as usize].seen,
+        ) && error(
+            s.inverse().transform_point(point(a)),
+            &scene.landmarks[b as usize].seen,
+        )
     };
-    let agreeing = |s: &Similarity| -> Vec<usize> { (0..pairs.len()).filter(|&i| fits(s, pairs[i])).collect() };
+    let agreeing = |s: &Similarity| -> Vec<usize> {
+        (0..pairs.len()).filter(|&i| fits(s, pairs[i])).collect()
+    };
     let mut rng = Pcg32::seed_from_u64(seed);
     let mut best: (Vec<usize>, Similarity) = (Vec::new(), Similarity::IDENTITY);
     for _ in 0..TRIES {
-        let sample: [(u32, u32); 3] = std::array::from_fn(|_| pairs[rng.random_range(0..pairs.len())]);
-        let Some(s) = aligned(&sample.map(|(a, b)| (point(a), point(b)))) else { continue };
+        let sample: [(u32, u32); 3] =
+            std::array::from_fn(|_| pairs[rng.random_range(0..pairs.len())]);
+        let Some(s) = aligned(&sample.map(|(a, b)| (point(a), point(b)))) else {
+            continue;
+        };
         let inliers = agreeing(&s);
         if inliers.len() > best.0.len() {
             best = (inliers, s);
         }
     }
     for _ in 0..2 {
-        let picked: Vec<(DVec3, DVec3)> = best.0.iter().map(|&i| (point(pairs[i].0), point(pairs[i].1))).collect();
+        let picked: Vec<(DVec3, DVec3)> = best
+            .0
+            .iter()
+            .map(|&i| (point(pairs[i].0), point(pairs[i].1)))
+            .collect();
         let Some(s) = aligned(&picked) else { break };
         let inliers = agreeing(&s);
         if inliers.len() < best.0.len() {
@@ -130,7 +167,8 @@ pub(super) fn aligned(pairs: &[(DVec3, DVec3)]) -> Option<Similarity> {
     let mut variance = 0.0;
     for (t, s) in pairs {
         let (t, s) = (*t - target_mean, *s - source_mean);
-        covariance += nalgebra::Vector3::new(t.x, t.y, t.z) * nalgebra::RowVector3::new(s.x, s.y, s.z) / n;
+        covariance +=
+            nalgebra::Vector3::new(t.x, t.y, t.z) * nalgebra::RowVector3::new(s.x, s.y, s.z) / n;
         variance += s.length_squared() / n;
     }
     let svd = covariance.svd(true, true);
@@ -142,6 +180,10 @@ pub(super) fn aligned(pairs: &[(DVec3, DVec3)]) -> Option<Similarity> {
     let r = u * Matrix3::from_diagonal(&signs) * vt;
     let scale = svd.singular_values.dot(&signs) / variance;
     let rotation = DQuat::from_mat3(&DMat3::from_cols_slice(r.as_slice())).normalize();
-    let found = Similarity { scale, rotation, translation: target_mean - rotation * source_mean * scale };
+    let found = Similarity {
+        scale,
+        rotation,
+        translation: target_mean - rotation * source_mean * scale,
+    };
     (scale.is_finite() && scale > 1e-6 && found.rotation.is_finite()).then_some(found)
 }

@@ -84,10 +84,17 @@ impl Sfm {
     pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
         let limits = self.limits(&batch.keyframes);
-        let fresh: Vec<&Arc<Keyframe>> = batch.keyframes.iter().filter(|k| self.shot_of(k.id).is_none()).collect();
+        let fresh: Vec<&Arc<Keyframe>> = batch
+            .keyframes
+            .iter()
+            .filter(|k| self.shot_of(k.id).is_none())
+            .collect();
         let looked = |keyframe: &&Arc<Keyframe>| {
             let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
-            (features(&picture, self.sfm.max_features), (picture.width as u32, picture.height as u32))
+            (
+                features(&picture, self.sfm.max_features),
+                (picture.width as u32, picture.height as u32),
+            )
         };
         let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
         for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
@@ -98,14 +105,23 @@ impl Sfm {
         let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
         self.place_waiting(newest, &limits, MIN_NEW_COMPONENT);
         self.adjust_grown(&limits);
-        let shared: Vec<usize> =
-            batch.keyframes.iter().take(batch.n_shared).filter_map(|k| self.shot_of(k.id)).collect();
+        let shared: Vec<usize> = batch
+            .keyframes
+            .iter()
+            .take(batch.n_shared)
+            .filter_map(|k| self.shot_of(k.id))
+            .collect();
         self.tell(&shared)
     }
 
     /// Last chance for what waits, then all is adjusted together.
     pub fn finish_sparse(&mut self) -> SparseBatch {
-        let keyframes: Vec<Arc<Keyframe>> = self.scene.shots.iter().map(|s| Arc::clone(&s.keyframe)).collect();
+        let keyframes: Vec<Arc<Keyframe>> = self
+            .scene
+            .shots
+            .iter()
+            .map(|s| Arc::clone(&s.keyframe))
+            .collect();
         let limits = self.limits(&keyframes);
         let waiting = self.waiting();
         for &shot in &waiting {
@@ -128,7 +144,11 @@ impl Sfm {
 
     fn limits(&self, keyframes: &[Arc<Keyframe>]) -> Limits {
         let longest = keyframes.iter().map(|k| {
-            let (w, h) = working_size(k.frame.image.width_px, k.frame.image.height_px, self.sfm.max_side);
+            let (w, h) = working_size(
+                k.frame.image.width_px,
+                k.frame.image.height_px,
+                self.sfm.max_side,
+            );
             w.max(h)
         });
         let side = f64::from(longest.max().unwrap_or(self.sfm.max_side));
@@ -142,14 +162,19 @@ impl Sfm {
 
     fn shot_of(&self, keyframe_id: u32) -> Option<usize> {
         // The newest are asked for most.
-        self.scene.shots.iter().rposition(|s| s.keyframe.id == keyframe_id)
+        self.scene
+            .shots
+            .iter()
+            .rposition(|s| s.keyframe.id == keyframe_id)
     }
 
     /// Adds a shot whose features are given in a working picture of that size.
     fn push(&mut self, keyframe: &Arc<Keyframe>, found: Features, (w, h): (u32, u32)) {
         let image = &keyframe.frame.image;
         let known = keyframe.frame.intrinsics.filter(Intrinsics::is_plausible);
-        let lens = known.unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px)).resized(w, h);
+        let lens = known
+            .unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px))
+            .resized(w, h);
         self.scene.shots.push(Shot {
             keyframe: Arc::clone(keyframe),
             signature: signature(&found),
@@ -165,18 +190,38 @@ impl Sfm {
 
     fn guessed_lens(&self, width_px: u32, height_px: u32) -> Intrinsics {
         let (w, h) = (f64::from(width_px), f64::from(height_px));
-        let guess = if self.sfm.focal_guess > 0.0 { self.sfm.focal_guess } else { FIRST_FOCAL * w.max(h) };
+        let guess = if self.sfm.focal_guess > 0.0 {
+            self.sfm.focal_guess
+        } else {
+            FIRST_FOCAL * w.max(h)
+        };
         let f = current_share(&self.scene).map_or(guess, |share| share * w.max(h));
-        Intrinsics { width_px, height_px, fx: f, fy: f, cx: 0.5 * w, cy: 0.5 * h }
+        Intrinsics {
+            width_px,
+            height_px,
+            fx: f,
+            fy: f,
+            cx: 0.5 * w,
+            cy: 0.5 * h,
+        }
     }
 
     /// Starts a component of the waiting shots, if there are enough of them.
     fn try_start(&mut self, pool: &[usize], min_shots: usize, limits: &Limits) -> Option<Start> {
         let is_first = self.scene.components.is_empty();
-        let waiting = pool.iter().filter(|&&s| self.scene.shots[s].placed.is_none());
-        let n_uncalibrated = waiting.clone().filter(|&&s| !self.scene.shots[s].is_calibrated).count();
+        let waiting = pool
+            .iter()
+            .filter(|&&s| self.scene.shots[s].placed.is_none());
+        let n_uncalibrated = waiting
+            .clone()
+            .filter(|&&s| !self.scene.shots[s].is_calibrated)
+            .count();
         let n_waiting = waiting.count();
-        let needed = if is_first { pool.len().min(3) } else { min_shots };
+        let needed = if is_first {
+            pool.len().min(3)
+        } else {
+            min_shots
+        };
         if n_waiting < needed.max(2) {
             return None;
         }
@@ -187,12 +232,16 @@ impl Sfm {
         if n_waiting < MIN_UNCALIBRATED && !is_last_chance {
             return None;
         }
-        let guess = (self.sfm.focal_guess > 0.0).then(|| current_share(&self.scene)).flatten();
+        let guess = (self.sfm.focal_guess > 0.0)
+            .then(|| current_share(&self.scene))
+            .flatten();
         Some(start_uncalibrated(&mut self.scene, pool, guess, limits))
     }
 
     fn waiting(&self) -> Vec<usize> {
-        (0..self.scene.shots.len()).filter(|&s| self.scene.shots[s].placed.is_none()).collect()
+        (0..self.scene.shots.len())
+            .filter(|&s| self.scene.shots[s].placed.is_none())
+            .collect()
     }
 
     fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_shots: usize) {

@@ -28,7 +28,11 @@ pub(super) fn grow(scene: &mut Scene, pool: &[usize], limits: &Limits) {
         extend(scene, shot, limits.max_error_px);
         adjust_local(scene, shot, limits.max_error_px);
         // Landmarks that the adjustment threw out again spoke for a wrong pose.
-        let n_left = scene.shots[shot].landmark_of.iter().filter(|l| **l != NONE).count();
+        let n_left = scene.shots[shot]
+            .landmark_of
+            .iter()
+            .filter(|l| **l != NONE)
+            .count();
         if 3 * n_left < 2 * limits.min_inliers {
             scene.unplace(shot);
             scene.shots[shot].failed_with = pairs.len();
@@ -45,7 +49,9 @@ pub(super) fn grow(scene: &mut Scene, pool: &[usize], limits: &Limits) {
 pub(super) fn correspondences(scene: &Scene, shot_ix: usize, component: u32) -> Vec<(u32, u32)> {
     let mut pairs = Vec::new();
     for (feature, matched) in scene.shots[shot_ix].matched.iter().enumerate() {
-        let owners = matched.iter().map(|&(s, f)| scene.shots[s as usize].landmark_of[f as usize]);
+        let owners = matched
+            .iter()
+            .map(|&(s, f)| scene.shots[s as usize].landmark_of[f as usize]);
         let mut named: Vec<u32> = owners.filter(|&l| l != NONE).collect();
         named.retain(|&l| scene.landmarks[l as usize].component == component);
         named.sort_unstable();
@@ -65,7 +71,9 @@ fn best_waiting(scene: &Scene, pool: &[usize], limits: &Limits) -> Option<Waitin
     for &shot in pool.iter().filter(|&&s| scene.shots[s].placed.is_none()) {
         for component in 0..scene.components.len() as u32 {
             let pairs = correspondences(scene, shot, component);
-            let needed = limits.min_inliers.max(scene.shots[shot].failed_with * 6 / 5 + 1);
+            let needed = limits
+                .min_inliers
+                .max(scene.shots[shot].failed_with * 6 / 5 + 1);
             let is_better = best.as_ref().is_none_or(|b| pairs.len() > b.2.len());
             if pairs.len() >= needed && is_better {
                 best = Some((shot, component, pairs));
@@ -75,12 +83,29 @@ fn best_waiting(scene: &Scene, pool: &[usize], limits: &Limits) -> Option<Waitin
     best
 }
 
-fn pose(scene: &Scene, shot_ix: usize, pairs: &[(u32, u32)], limits: &Limits) -> Option<crate::pose::Rigid> {
+fn pose(
+    scene: &Scene,
+    shot_ix: usize,
+    pairs: &[(u32, u32)],
+    limits: &Limits,
+) -> Option<crate::pose::Rigid> {
     let shot = &scene.shots[shot_ix];
-    let points: Vec<DVec3> = pairs.iter().map(|p| scene.landmarks[p.1 as usize].point).collect();
-    let pixels: Vec<DVec2> = pairs.iter().map(|p| shot.features.pixels[p.0 as usize]).collect();
+    let points: Vec<DVec3> = pairs
+        .iter()
+        .map(|p| scene.landmarks[p.1 as usize].point)
+        .collect();
+    let pixels: Vec<DVec2> = pairs
+        .iter()
+        .map(|p| shot.features.pixels[p.0 as usize])
+        .collect();
     let seed = pair_seed(limits.seed, shot_ix, pairs.len());
-    let found = pnp::place(&points, &pixels, &shot.lens, (1.5 * limits.max_error_px, limits.min_inliers), seed)?;
+    let found = pnp::place(
+        &points,
+        &pixels,
+        &shot.lens,
+        (1.5 * limits.max_error_px, limits.min_inliers),
+        seed,
+    )?;
     let share = found.inliers.len() as f64 / pairs.len() as f64;
     let picked: Vec<DVec2> = found.inliers.iter().map(|&i| pixels[i]).collect();
     let longest = f64::from(shot.lens.width_px.max(shot.lens.height_px));

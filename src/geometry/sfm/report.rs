@@ -90,7 +90,12 @@ impl Told {
 
 /// One sentence on what is missing; `None` when all is placed in one frame.
 pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
-    let waiting: Vec<u32> = scene.shots.iter().filter(|s| s.placed.is_none()).map(|s| s.keyframe.id).collect();
+    let waiting: Vec<u32> = scene
+        .shots
+        .iter()
+        .filter(|s| s.placed.is_none())
+        .map(|s| s.keyframe.id)
+        .collect();
     if waiting.len() == scene.shots.len() {
         let why = match start {
             Some(Start::NoMatches) => ": their pictures share too few distinct points",
@@ -99,10 +104,15 @@ pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
         };
         return Some(format!("{NO_PARALLAX}{why}"));
     }
-    let n_components = scene.components.iter().filter(|c| !c.shots.is_empty()).count();
+    let n_components = scene
+        .components
+        .iter()
+        .filter(|c| !c.shots.is_empty())
+        .count();
     if waiting.is_empty() {
-        return (n_components > 1)
-            .then(|| format!("the keyframes form {n_components} parts that share too few landmarks"));
+        return (n_components > 1).then(|| {
+            format!("the keyframes form {n_components} parts that share too few landmarks")
+        });
     }
     let shown: Vec<String> = waiting.iter().take(10).map(u32::to_string).collect();
     let more = if waiting.len() > 10 { ", ..." } else { "" };
@@ -124,11 +134,19 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     );
     let mut landmarks = Vec::new();
     let mut errors = Vec::new();
-    for (feature, &landmark) in shot.landmark_of.iter().enumerate().filter(|(_, l)| **l != NONE) {
+    for (feature, &landmark) in shot
+        .landmark_of
+        .iter()
+        .enumerate()
+        .filter(|(_, l)| **l != NONE)
+    {
         let at = (shot_ix as u32, feature as u32);
         let point_in_batch = scene.landmarks[landmark as usize].point;
         errors.extend(scene.sight(at).map(|s| s.error_px(point_in_batch)));
-        landmarks.push(Sighting { point_in_batch, pixel: scene.pixel(at) * to_picture });
+        landmarks.push(Sighting {
+            point_in_batch,
+            pixel: scene.pixel(at) * to_picture,
+        });
     }
     let health = Health {
         n_inliers: landmarks.len() as u32,
@@ -147,14 +165,25 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
 }
 
 fn neighbours(scene: &Scene, shot_ix: usize) -> Vec<Neighbour> {
-    let Some(own) = scene.centre(shot_ix) else { return Vec::new() };
+    let Some(own) = scene.centre(shot_ix) else {
+        return Vec::new();
+    };
     let mut angles: BTreeMap<u32, Vec<f64>> = BTreeMap::new();
-    for &landmark in scene.shots[shot_ix].landmark_of.iter().filter(|l| **l != NONE) {
+    for &landmark in scene.shots[shot_ix]
+        .landmark_of
+        .iter()
+        .filter(|l| **l != NONE)
+    {
         let landmark = &scene.landmarks[landmark as usize];
         for &(other, _) in landmark.seen.iter().filter(|s| s.0 as usize != shot_ix) {
-            let Some(centre) = scene.centre(other as usize) else { continue };
+            let Some(centre) = scene.centre(other as usize) else {
+                continue;
+            };
             let (a, b) = (own - landmark.point, centre - landmark.point);
-            angles.entry(other).or_default().push(a.cross(b).length().atan2(a.dot(b)).to_degrees());
+            angles
+                .entry(other)
+                .or_default()
+                .push(a.cross(b).length().atan2(a.dot(b)).to_degrees());
         }
     }
     let neighbour = |(other, mut angles): (u32, Vec<f64>)| Neighbour {
@@ -168,6 +197,10 @@ fn neighbours(scene: &Scene, shot_ix: usize) -> Vec<Neighbour> {
         f64::from(n.n_shared) * (-0.5 * off * off).exp()
     };
     let mut found: Vec<Neighbour> = angles.into_iter().map(neighbour).collect();
-    found.sort_by(|a, b| worth(b).total_cmp(&worth(a)).then(a.keyframe_id.cmp(&b.keyframe_id)));
+    found.sort_by(|a, b| {
+        worth(b)
+            .total_cmp(&worth(a))
+            .then(a.keyframe_id.cmp(&b.keyframe_id))
+    });
     found
 }

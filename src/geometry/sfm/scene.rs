@@ -81,18 +81,33 @@ impl Scene {
     pub(super) fn sight(&self, at: (u32, u32)) -> Option<Sight<'_>> {
         let shot = &self.shots[at.0 as usize];
         let placed = shot.placed.as_ref()?;
-        Some(Sight { cam_from_map: &placed.cam_from_map, intrinsics: &shot.lens, pixel: self.pixel(at) })
+        Some(Sight {
+            cam_from_map: &placed.cam_from_map,
+            intrinsics: &shot.lens,
+            pixel: self.pixel(at),
+        })
     }
 
     /// Intrinsics at the size of the keyframe's picture.
     pub(super) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
-        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        let shot = self
+            .shots
+            .iter()
+            .rev()
+            .find(|s| s.keyframe.id == keyframe_id)?;
         let frame = &shot.keyframe.frame;
-        Some(frame.intrinsics.unwrap_or_else(|| shot.lens.resized(frame.image.width_px, frame.image.height_px)))
+        Some(frame.intrinsics.unwrap_or_else(|| {
+            shot.lens
+                .resized(frame.image.width_px, frame.image.height_px)
+        }))
     }
 
     pub(super) fn image_of(&self, keyframe_id: u32) -> Option<Arc<RgbImage>> {
-        let shot = self.shots.iter().rev().find(|s| s.keyframe.id == keyframe_id)?;
+        let shot = self
+            .shots
+            .iter()
+            .rev()
+            .find(|s| s.keyframe.id == keyframe_id)?;
         Some(Arc::clone(&shot.keyframe.frame.image))
     }
 
@@ -101,11 +116,17 @@ impl Scene {
     }
 
     pub(super) fn centre(&self, shot_ix: usize) -> Option<DVec3> {
-        self.shots[shot_ix].placed.as_ref().map(|p| p.cam_from_map.inverse().translation)
+        self.shots[shot_ix]
+            .placed
+            .as_ref()
+            .map(|p| p.cam_from_map.inverse().translation)
     }
 
     pub(super) fn place(&mut self, shot_ix: usize, component: u32, cam_from_map: Rigid) {
-        self.shots[shot_ix].placed = Some(Placed { component, cam_from_map });
+        self.shots[shot_ix].placed = Some(Placed {
+            component,
+            cam_from_map,
+        });
         self.components[component as usize].shots.push(shot_ix);
     }
 
@@ -115,16 +136,27 @@ impl Scene {
             self.retain_sights(landmark, |s| s.0 as usize != shot_ix);
         }
         if let Some(placed) = self.shots[shot_ix].placed.take() {
-            self.components[placed.component as usize].shots.retain(|&s| s != shot_ix);
+            self.components[placed.component as usize]
+                .shots
+                .retain(|&s| s != shot_ix);
         }
     }
 
-    pub(super) fn add_landmark(&mut self, point: DVec3, component: u32, seen: Vec<(u32, u32)>) -> u32 {
+    pub(super) fn add_landmark(
+        &mut self,
+        point: DVec3,
+        component: u32,
+        seen: Vec<(u32, u32)>,
+    ) -> u32 {
         let ix = self.landmarks.len() as u32;
         for &(shot, feature) in &seen {
             self.shots[shot as usize].landmark_of[feature as usize] = ix;
         }
-        self.landmarks.push(Landmark { point, component, seen });
+        self.landmarks.push(Landmark {
+            point,
+            component,
+            seen,
+        });
         ix
     }
 
@@ -143,7 +175,11 @@ impl Scene {
     pub(super) fn retain_sights(&mut self, landmark_ix: u32, keep: impl Fn(&(u32, u32)) -> bool) {
         let landmark = &mut self.landmarks[landmark_ix as usize];
         let (kept, gone): (Vec<_>, Vec<_>) = landmark.seen.iter().partition(|s| keep(s));
-        let (kept, gone) = if kept.len() < 2 { (Vec::new(), landmark.seen.clone()) } else { (kept, gone) };
+        let (kept, gone) = if kept.len() < 2 {
+            (Vec::new(), landmark.seen.clone())
+        } else {
+            (kept, gone)
+        };
         landmark.seen = kept;
         for (shot, feature) in gone {
             self.shots[shot as usize].landmark_of[feature as usize] = NONE;
@@ -161,7 +197,9 @@ impl Scene {
 
     /// Landmarks seen by any of the shots, in order.
     pub(super) fn landmarks_of(&self, shots: &[usize]) -> Vec<u32> {
-        let all = shots.iter().flat_map(|&s| self.shots[s].landmark_of.iter().copied());
+        let all = shots
+            .iter()
+            .flat_map(|&s| self.shots[s].landmark_of.iter().copied());
         let mut found: Vec<u32> = all.filter(|&l| l != NONE).collect();
         found.sort_unstable();
         found.dedup();
@@ -171,7 +209,11 @@ impl Scene {
     /// How many landmarks every other shot shares with one, by shot index.
     pub(super) fn shared_counts(&self, shot_ix: usize) -> BTreeMap<usize, u32> {
         let mut counts = BTreeMap::new();
-        for &landmark in self.shots[shot_ix].landmark_of.iter().filter(|l| **l != NONE) {
+        for &landmark in self.shots[shot_ix]
+            .landmark_of
+            .iter()
+            .filter(|l| **l != NONE)
+        {
             for &(other, _) in &self.landmarks[landmark as usize].seen {
                 if other as usize != shot_ix {
                     *counts.entry(other as usize).or_insert(0) += 1;
@@ -205,7 +247,9 @@ impl Scene {
         }
         for shot in shots {
             if let Some(placed) = &mut self.shots[shot].placed {
-                placed.cam_from_map = new_from_old.transform_pose(&placed.cam_from_map.inverse()).inverse();
+                placed.cam_from_map = new_from_old
+                    .transform_pose(&placed.cam_from_map.inverse())
+                    .inverse();
             }
         }
     }
@@ -213,8 +257,16 @@ impl Scene {
     /// Distances from a shot to the landmarks it sees, along its axis.
     pub(super) fn depths(&self, shot_ix: usize) -> Vec<f64> {
         let shot = &self.shots[shot_ix];
-        let Some(placed) = &shot.placed else { return Vec::new() };
+        let Some(placed) = &shot.placed else {
+            return Vec::new();
+        };
         let seen = shot.landmark_of.iter().filter(|l| **l != NONE);
-        seen.map(|&l| placed.cam_from_map.transform_point(self.landmarks[l as usize].point).z).collect()
+        seen.map(|&l| {
+            placed
+                .cam_from_map
+                .transform_point(self.landmarks[l as usize].point)
+                .z
+        })
+        .collect()
     }
 }

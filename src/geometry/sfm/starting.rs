@@ -37,14 +37,24 @@ pub(super) enum Start {
 
 /// Tries to start a component from waiting shots of `pool` with at least `min_shots` in it.
 pub(super) fn start(scene: &mut Scene, pool: &[usize], min_shots: usize, limits: &Limits) -> Start {
-    let waiting: Vec<usize> = pool.iter().copied().filter(|&s| scene.shots[s].placed.is_none()).collect();
+    let waiting: Vec<usize> = pool
+        .iter()
+        .copied()
+        .filter(|&s| scene.shots[s].placed.is_none())
+        .collect();
     let (pairs, has_matches) = ranked_pairs(scene, &waiting, limits);
     if pairs.is_empty() {
-        return if has_matches { Start::NoParallax } else { Start::NoMatches };
+        return if has_matches {
+            Start::NoParallax
+        } else {
+            Start::NoMatches
+        };
     }
     let mut best: Option<(usize, (usize, usize))> = None;
     for (_, a, b) in pairs.into_iter().take(MAX_ATTEMPTS) {
-        let Some(n) = attempt(scene, &waiting, (a, b), min_shots, limits) else { continue };
+        let Some(n) = attempt(scene, &waiting, (a, b), min_shots, limits) else {
+            continue;
+        };
         if n as f64 >= GOOD_SHARE * waiting.len() as f64 {
             return Start::Started;
         }
@@ -56,15 +66,26 @@ pub(super) fn start(scene: &mut Scene, pool: &[usize], min_shots: usize, limits:
         }
     }
     let again = best.and_then(|(_, pair)| attempt(scene, &waiting, pair, min_shots, limits));
-    if again.is_some() { Start::Started } else { Start::Unstable }
+    if again.is_some() {
+        Start::Started
+    } else {
+        Start::Unstable
+    }
 }
 
 /// Pairs with parallax, best first, and whether any pair had matches enough.
-fn ranked_pairs(scene: &mut Scene, waiting: &[usize], limits: &Limits) -> (Vec<(f64, usize, usize)>, bool) {
+fn ranked_pairs(
+    scene: &mut Scene,
+    waiting: &[usize],
+    limits: &Limits,
+) -> (Vec<(f64, usize, usize)>, bool) {
     let mut pairs = Vec::new();
     let mut has_matches = false;
     let keys: Vec<(usize, usize)> = scene.links.keys().copied().collect();
-    for (a, b) in keys.into_iter().filter(|(a, b)| waiting.contains(a) && waiting.contains(b)) {
+    for (a, b) in keys
+        .into_iter()
+        .filter(|(a, b)| waiting.contains(a) && waiting.contains(b))
+    {
         let link = &scene.links[&(a, b)];
         let n = link.matches.len();
         if n < limits.min_inliers {
@@ -75,9 +96,12 @@ fn ranked_pairs(scene: &mut Scene, waiting: &[usize], limits: &Limits) -> (Vec<(
         let pixels = pixel_pairs(&scene.shots[a], &scene.shots[b], &link.matches);
         let lenses = [&scene.shots[a].lens, &scene.shots[b].lens];
         let found = link.motion.or_else(|| {
-            motion(&pixels, lenses, limits.max_error_px, seed).map(|m| (m.second_from_first, m.parallax_deg))
+            motion(&pixels, lenses, limits.max_error_px, seed)
+                .map(|m| (m.second_from_first, m.parallax_deg))
         });
-        let Some((pose, parallax)) = found else { continue };
+        let Some((pose, parallax)) = found else {
+            continue;
+        };
         if parallax < limits.min_parallax_deg {
             continue;
         }
@@ -136,10 +160,17 @@ fn attempt(
 
 /// Median of the widest angles at which the landmarks of a shot are seen.
 pub(super) fn parallax_deg(scene: &Scene, shot_ix: usize) -> f64 {
-    let seen = scene.shots[shot_ix].landmark_of.iter().filter(|l| **l != NONE);
+    let seen = scene.shots[shot_ix]
+        .landmark_of
+        .iter()
+        .filter(|l| **l != NONE);
     let angle = |&l: &u32| {
         let landmark = &scene.landmarks[l as usize];
-        let centres: Vec<_> = landmark.seen.iter().filter_map(|at| scene.centre(at.0 as usize)).collect();
+        let centres: Vec<_> = landmark
+            .seen
+            .iter()
+            .filter_map(|at| scene.centre(at.0 as usize))
+            .collect();
         widest_angle(&centres, landmark.point).to_degrees()
     };
     median(&mut seen.map(angle).collect::<Vec<f64>>()).unwrap_or(0.0)
@@ -167,6 +198,12 @@ pub(super) fn explained_share(scene: &Scene, component: u32) -> f64 {
 /// Median depth in the first shot becomes 1.
 fn normalise(scene: &mut Scene, component: u32, first: usize) {
     if let Some(depth) = median(&mut scene.depths(first)).filter(|d| *d > 0.0) {
-        scene.transform(component, &Similarity { scale: 1.0 / depth, ..Similarity::IDENTITY });
+        scene.transform(
+            component,
+            &Similarity {
+                scale: 1.0 / depth,
+                ..Similarity::IDENTITY
+            },
+        );
     }
 }

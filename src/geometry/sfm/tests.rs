@@ -14,7 +14,14 @@ use crate::pose::Rigid;
 const SIZE: (u32, u32) = (640, 480);
 
 fn camera() -> Intrinsics {
-    Intrinsics { width_px: SIZE.0, height_px: SIZE.1, fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 }
+    Intrinsics {
+        width_px: SIZE.0,
+        height_px: SIZE.1,
+        fx: 500.0,
+        fy: 500.0,
+        cx: 320.0,
+        cy: 240.0,
+    }
 }
 
 struct World {
@@ -27,8 +34,14 @@ impl World {
     fn new(n: usize, mut point: impl FnMut(&mut Pcg32) -> DVec3) -> Self {
         let mut rng = Pcg32::seed_from_u64(7);
         let points = (0..n).map(|_| point(&mut rng)).collect();
-        let descriptors = (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0..90))).collect();
-        Self { points, descriptors, rng }
+        let descriptors = (0..n)
+            .map(|_| std::array::from_fn(|_| rng.random_range(0..90)))
+            .collect();
+        Self {
+            points,
+            descriptors,
+            rng,
+        }
     }
 
     /// What a camera sees, with 0.3 px of noise and every tenth descriptor on the wrong point.
@@ -36,11 +49,21 @@ impl World {
         let cam_from_world = world_from_cam.inverse();
         let mut out = Features::default();
         for i in 0..self.points.len() {
-            let Some(pixel) = camera().project(cam_from_world.transform_point(self.points[i])) else { continue };
+            let Some(pixel) = camera().project(cam_from_world.transform_point(self.points[i]))
+            else {
+                continue;
+            };
             let inside = pixel.cmpge(DVec2::ZERO).all() && pixel.x < 640.0 && pixel.y < 480.0;
             if inside {
-                let noise = DVec2::new(self.rng.random_range(-0.5..0.5), self.rng.random_range(-0.5..0.5));
-                let named = if i % 10 == 0 { self.rng.random_range(0..self.points.len()) } else { i };
+                let noise = DVec2::new(
+                    self.rng.random_range(-0.5..0.5),
+                    self.rng.random_range(-0.5..0.5),
+                );
+                let named = if i % 10 == 0 {
+                    self.rng.random_range(0..self.points.len())
+                } else {
+                    i
+                };
                 out.pixels.push(pixel + noise);
                 out.sigmas.push(2.0);
                 out.descriptors.push(self.descriptors[named]);
@@ -51,7 +74,9 @@ impl World {
 }
 
 fn cloud() -> World {
-    World::new(900, |rng| DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::Z * 5.0)
+    World::new(900, |rng| {
+        DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::Z * 5.0
+    })
 }
 
 /// Cameras on an arc round the cloud, looking at its middle.
@@ -59,7 +84,10 @@ fn arc(n: usize, from_deg: f64, to_deg: f64) -> Vec<Rigid> {
     let at = |i: usize| {
         let angle = (from_deg + (to_deg - from_deg) * i as f64 / (n - 1) as f64).to_radians();
         let rotation = DQuat::from_rotation_y(-angle);
-        Rigid::new(rotation, DVec3::Z * 5.0 - rotation * DVec3::Z * (5.0 + 0.3 * (i % 3) as f64))
+        Rigid::new(
+            rotation,
+            DVec3::Z * 5.0 - rotation * DVec3::Z * (5.0 + 0.3 * (i % 3) as f64),
+        )
     };
     (0..n).map(at).collect()
 }
@@ -67,12 +95,30 @@ fn arc(n: usize, from_deg: f64, to_deg: f64) -> Vec<Rigid> {
 fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (Sfm, SparseBatch) {
     let params = Settings::shipped().params().unwrap();
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
-    let image = Arc::new(RgbImage { width_px: SIZE.0, height_px: SIZE.1, pixels: vec![0; 640 * 480 * 3] });
+    let image = Arc::new(RgbImage {
+        width_px: SIZE.0,
+        height_px: SIZE.1,
+        pixels: vec![0; 640 * 480 * 3],
+    });
     for (id, pose) in poses.iter().enumerate() {
         let stamp = Stamp::from_secs(id as f64);
-        let frame =
-            Frame { seq: id as u64, stamp, image: Arc::clone(&image), intrinsics, truth: None, truth_depth: None };
-        sfm.push(&Arc::new(Keyframe { id: id as u32, frame, age: Stopwatch::start() }), world.seen_from(pose), SIZE);
+        let frame = Frame {
+            seq: id as u64,
+            stamp,
+            image: Arc::clone(&image),
+            intrinsics,
+            truth: None,
+            truth_depth: None,
+        };
+        sfm.push(
+            &Arc::new(Keyframe {
+                id: id as u32,
+                frame,
+                age: Stopwatch::start(),
+            }),
+            world.seen_from(pose),
+            SIZE,
+        );
         let limits = sfm.limits(&[]);
         link_newest(&mut sfm.scene, limits.max_error_px, 1);
         if id % 6 == 5 {
@@ -86,15 +132,29 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
 
 /// Largest rotation error and largest position error as a share of the mean distance, relative to the first pose.
 fn worst(out: &SparseBatch, truth: &[Rigid]) -> (f64, f64) {
-    let own: Vec<(usize, Rigid)> = out.views.iter().map(|v| (v.keyframe_id as usize, v.batch_from_cam)).collect();
+    let own: Vec<(usize, Rigid)> = out
+        .views
+        .iter()
+        .map(|v| (v.keyframe_id as usize, v.batch_from_cam))
+        .collect();
     let first = own[0];
     let relative = |a: &Rigid, b: &Rigid| a.inverse() * *b;
-    let pairs: Vec<(Rigid, Rigid)> =
-        own.iter().map(|(i, p)| (relative(&truth[first.0], &truth[*i]), relative(&first.1, p))).collect();
-    let length = |f: fn(&(Rigid, Rigid)) -> Rigid| pairs.iter().map(|p| f(p).translation.length()).sum::<f64>();
+    let pairs: Vec<(Rigid, Rigid)> = own
+        .iter()
+        .map(|(i, p)| (relative(&truth[first.0], &truth[*i]), relative(&first.1, p)))
+        .collect();
+    let length = |f: fn(&(Rigid, Rigid)) -> Rigid| {
+        pairs.iter().map(|p| f(p).translation.length()).sum::<f64>()
+    };
     let (size, scale) = (length(|p| p.0), length(|p| p.0) / length(|p| p.1));
-    let turned = pairs.iter().map(|(t, o)| t.angle_to(o).to_degrees()).fold(0.0, f64::max);
-    let off = pairs.iter().map(|(t, o)| t.translation.distance(o.translation * scale)).fold(0.0, f64::max);
+    let turned = pairs
+        .iter()
+        .map(|(t, o)| t.angle_to(o).to_degrees())
+        .fold(0.0, f64::max);
+    let off = pairs
+        .iter()
+        .map(|(t, o)| t.translation.distance(o.translation * scale))
+        .fold(0.0, f64::max);
     (turned, off / size * pairs.len() as f64)
 }
 
@@ -105,8 +165,13 @@ fn a_cloud_seen_along_an_arc_is_rebuilt() {
     assert_eq!((out.views.len(), out.note.as_ref()), (18, None));
     let (turned, off) = worst(&out, &poses);
     assert!(turned < 0.15 && off < 0.01, "{turned} deg, {off}");
-    let depth = crate::geometry::two_view::median(&mut sfm.scene.depths(sfm.scene.components[0].shots[0])).unwrap();
-    assert!((depth - 1.0).abs() < 0.1, "median depth {depth} in the first view");
+    let depth =
+        crate::geometry::two_view::median(&mut sfm.scene.depths(sfm.scene.components[0].shots[0]))
+            .unwrap();
+    assert!(
+        (depth - 1.0).abs() < 0.1,
+        "median depth {depth} in the first view"
+    );
 }
 
 #[test]
@@ -121,18 +186,31 @@ fn an_unknown_focal_length_is_found_with_the_poses() {
 
 #[test]
 fn a_camera_that_only_turns_places_nothing() {
-    let poses: Vec<Rigid> =
-        (0..12).map(|i| Rigid::new(DQuat::from_rotation_y(0.04 * f64::from(i)), DVec3::ZERO)).collect();
+    let poses: Vec<Rigid> = (0..12)
+        .map(|i| Rigid::new(DQuat::from_rotation_y(0.04 * f64::from(i)), DVec3::ZERO))
+        .collect();
     for intrinsics in [Some(camera()), None] {
         let (_, out) = run(&mut cloud(), &poses, intrinsics);
-        assert!(out.views.is_empty(), "{} views with {intrinsics:?}", out.views.len());
+        assert!(
+            out.views.is_empty(),
+            "{} views with {intrinsics:?}",
+            out.views.len()
+        );
         assert!(out.note.is_some_and(|note| note.contains(NO_PARALLAX)));
     }
 }
 
 #[test]
 fn a_plane_is_placed_right_or_not_at_all() {
-    let wall = || World::new(900, |rng| DVec3::new(rng.random_range(-4.0..4.0), rng.random_range(-3.0..3.0), 5.0));
+    let wall = || {
+        World::new(900, |rng| {
+            DVec3::new(
+                rng.random_range(-4.0..4.0),
+                rng.random_range(-3.0..3.0),
+                5.0,
+            )
+        })
+    };
     let poses = arc(12, -20.0, 20.0);
     let (_, out) = run(&mut wall(), &poses, Some(camera()));
     if !out.views.is_empty() {
@@ -140,24 +218,45 @@ fn a_plane_is_placed_right_or_not_at_all() {
         assert!(turned < 0.5 && off < 0.05, "{turned} deg, {off}");
     }
     let (_, out) = run(&mut wall(), &poses, None);
-    assert!(out.views.is_empty(), "one plane tells no focal length, yet {} views", out.views.len());
+    assert!(
+        out.views.is_empty(),
+        "one plane tells no focal length, yet {} views",
+        out.views.len()
+    );
 }
 
 #[test]
 fn two_parts_become_one_when_a_bridge_comes() {
     // Two clouds side by side; the first cameras see one, the next the other, the last both.
     let mut world = World::new(1600, |rng| {
-        let side = if rng.random_range(0..2) == 0 { -4.0 } else { 4.0 };
-        DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0))) + DVec3::new(side, 0.0, 8.0)
+        let side = if rng.random_range(0..2) == 0 {
+            -4.0
+        } else {
+            4.0
+        };
+        DVec3::from_array([(); 3].map(|()| rng.random_range(-2.0..2.0)))
+            + DVec3::new(side, 0.0, 8.0)
     });
-    let near =
-        |x: f64, i: usize| Rigid::new(DQuat::IDENTITY, DVec3::new(x + 0.4 * i as f64 - 1.0, 0.2 * (i % 2) as f64, 1.5));
-    let mut poses: Vec<Rigid> = (0..6).map(|i| near(-4.0, i)).chain((0..6).map(|i| near(4.0, i))).collect();
+    let near = |x: f64, i: usize| {
+        Rigid::new(
+            DQuat::IDENTITY,
+            DVec3::new(x + 0.4 * i as f64 - 1.0, 0.2 * (i % 2) as f64, 1.5),
+        )
+    };
+    let mut poses: Vec<Rigid> = (0..6)
+        .map(|i| near(-4.0, i))
+        .chain((0..6).map(|i| near(4.0, i)))
+        .collect();
     let (_, apart) = run(&mut world, &poses, Some(camera()));
     let parts: std::collections::BTreeSet<u32> = apart.views.iter().map(|v| v.component).collect();
     assert_eq!((apart.views.len(), parts.len()), (12, 2));
     assert!(apart.note.is_some_and(|n| n.contains("2 parts")));
-    poses.extend((0..6).map(|i| Rigid::new(DQuat::IDENTITY, DVec3::new(0.5 * f64::from(i) - 1.2, 0.3, -6.0))));
+    poses.extend((0..6).map(|i| {
+        Rigid::new(
+            DQuat::IDENTITY,
+            DVec3::new(0.5 * f64::from(i) - 1.2, 0.3, -6.0),
+        )
+    }));
     let (_, out) = run(&mut world, &poses, Some(camera()));
     let parts: std::collections::BTreeSet<u32> = out.views.iter().map(|v| v.component).collect();
     assert_eq!((out.views.len(), parts.len()), (18, 1), "{:?}", out.note);
@@ -168,7 +267,14 @@ fn two_parts_become_one_when_a_bridge_comes() {
 #[test]
 fn equal_input_gives_equal_poses() {
     let poses = arc(8, 0.0, 40.0);
-    let told = || run(&mut cloud(), &poses, None).1.views.iter().map(|v| v.batch_from_cam).collect::<Vec<_>>();
+    let told = || {
+        run(&mut cloud(), &poses, None)
+            .1
+            .views
+            .iter()
+            .map(|v| v.batch_from_cam)
+            .collect::<Vec<_>>()
+    };
     assert_eq!(told(), told());
 }
 
@@ -177,7 +283,11 @@ fn blank_tiny_and_broken_pictures_are_survived() {
     let params = Settings::shipped().params().unwrap();
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
     let picture = |id: u32, width_px: u32, height_px: u32, n: usize| {
-        let image = Arc::new(RgbImage { width_px, height_px, pixels: vec![90; n] });
+        let image = Arc::new(RgbImage {
+            width_px,
+            height_px,
+            pixels: vec![90; n],
+        });
         let frame = Frame {
             seq: 0,
             stamp: Stamp::from_secs(f64::from(id)),
@@ -186,11 +296,25 @@ fn blank_tiny_and_broken_pictures_are_survived() {
             truth: None,
             truth_depth: None,
         };
-        Arc::new(Keyframe { id, frame, age: Stopwatch::start() })
+        Arc::new(Keyframe {
+            id,
+            frame,
+            age: Stopwatch::start(),
+        })
     };
-    let keyframes =
-        vec![picture(0, 200, 100, 60_000), picture(1, 1, 1, 3), picture(2, 0, 0, 0), picture(3, 300, 200, 17)];
-    let out = sfm.infer(&Batch { id: 0, n_shared: 0, keyframes }).unwrap();
+    let keyframes = vec![
+        picture(0, 200, 100, 60_000),
+        picture(1, 1, 1, 3),
+        picture(2, 0, 0, 0),
+        picture(3, 300, 200, 17),
+    ];
+    let out = sfm
+        .infer(&Batch {
+            id: 0,
+            n_shared: 0,
+            keyframes,
+        })
+        .unwrap();
     assert!(out.views.is_empty() && out.note.is_some_and(|n| n.contains(NO_PARALLAX)));
     assert!(sfm.finish().unwrap().views.is_empty());
 }
