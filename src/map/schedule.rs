@@ -15,6 +15,8 @@ const N_NEWEST: usize = 8;
 const FINAL_MEAN_RATE: f32 = 0.01;
 const FINAL_POSE_RATE: f32 = 0.1;
 const FINAL_DEPTH_WEIGHT: f32 = 0.1;
+/// Between arrivals poses move slowly: splats that have just been seeded would pull them about.
+const STREAMING_POSE_RATE: f32 = 0.2;
 /// Bands above the base colour wait until the geometry has settled (3DGS trains them late).
 const SH_START: f32 = 0.3;
 /// Rate of the SH bands above the base, as a share of the base rate (3DGS).
@@ -76,6 +78,11 @@ pub fn settings(params: &MapParams, scene_depth: f32, phase: Phase) -> StepSetti
         Phase::Final(share) => share.clamp(0.0, 1.0),
     };
     let decayed = |rate: f32, last: f32| rate * last.powf(done);
+    let pose_share = if phase == Phase::Streaming {
+        STREAMING_POSE_RATE
+    } else {
+        1.0
+    };
     let sh_is_on = phase != Phase::Streaming && done >= SH_START;
     StepSettings {
         lr_mean: decayed(params.lr_mean * scene_depth, FINAL_MEAN_RATE),
@@ -84,8 +91,9 @@ pub fn settings(params: &MapParams, scene_depth: f32, phase: Phase) -> StepSetti
         lr_opacity: params.lr_opacity,
         lr_sh0: params.lr_sh,
         lr_sh_rest: params.lr_sh * SH_REST_RATE,
-        lr_pose_rotation: decayed(params.lr_rotation, FINAL_POSE_RATE),
-        lr_pose_translation: decayed(params.lr_translation * scene_depth, FINAL_POSE_RATE),
+        lr_pose_rotation: pose_share * decayed(params.lr_rotation, FINAL_POSE_RATE),
+        lr_pose_translation: pose_share
+            * decayed(params.lr_translation * scene_depth, FINAL_POSE_RATE),
         ssim_weight: params.ssim_weight,
         depth_weight: decayed(params.depth_weight, FINAL_DEPTH_WEIGHT),
         opacity_reg: params.opacity_reg,

@@ -337,9 +337,9 @@ fn evaluation_errors_name_the_file_and_the_way_out() {
     std::fs::write(&keyframes, "1.0 0 0 0 0 0 0 1\n").unwrap();
     std::fs::write(&reference, [0xff, 0xfe, 0x00]).unwrap();
     assert!(message().contains("UTF-8"), "{}", message());
-    std::fs::write(&reference, "5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n").unwrap();
+    std::fs::write(&reference, "5.5 0 0 0 0 0 0 1\n6.5 0 0 0 0 0 0 1\n").unwrap();
     assert!(
-        message().contains("1.000000000") && message().contains("5.000000000 to 6.000000000"),
+        message().contains("1.000000000") && message().contains("5.500000000 to 6.500000000"),
         "{}",
         message()
     );

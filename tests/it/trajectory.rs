@@ -137,3 +137,20 @@ fn damaged_files_end_in_poses_or_an_error_never_a_panic() {
     }
     assert!(n_read > 100 && n_refused > 100, "{n_read} {n_refused}");
 }
+
+#[test]
+fn a_recording_with_an_epoch_of_its_own_still_meets_its_reference() {
+    use splat_mapper::eval::trajectory::{TOLERANCE_SECS, shifted, stamp_offset_nanos};
+    let at = |i: i64| TimedPose {
+        stamp: Stamp::from_nanos(100_000_000 * i),
+        pose: Rigid::IDENTITY,
+    };
+    let reference: Vec<TimedPose> = (0..100).map(at).collect();
+    let run: Vec<TimedPose> = (3..90).step_by(4).map(at).collect();
+    let epoch = 1_700_000_000 * 1_000_000_000;
+    let offset = |run: &[TimedPose]| stamp_offset_nanos(run, &reference, TOLERANCE_SECS);
+    assert_eq!(offset(&run), 0, "stamps that meet stay as they are");
+    assert_eq!(offset(&shifted(&run, epoch)), -epoch);
+    // Half a frame beside every reference stamp: no whole number of seconds helps.
+    assert_eq!(offset(&shifted(&run, epoch + 50_000_000)), 0);
+}
