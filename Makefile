@@ -21,7 +21,7 @@ lint:
 # Figures for docs/BENCHMARKS.md: every stage and the whole step, sizes in the names.
 bench:
 	scripts/setup build
-	cargo bench --locked --bench stages
+	cargo bench --locked --profile release --bench stages
 
 setup:
 	scripts/setup all

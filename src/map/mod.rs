@@ -33,6 +33,9 @@ pub const MAX_WAITING: usize = 200;
 /// Steps between looks at a view for holes and errors, and between removals of transparent splats.
 const RESEED_EVERY: u64 = 50;
 const PRUNE_EVERY: u64 = 400;
+/// Steps between points of the loss curve at first, and the points beyond which the distance doubles.
+const FIRST_NOTE_EVERY: u64 = 20;
+const MAX_CURVE: usize = 400;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to settle.
 const LAST_RESEED: f32 = 0.6;
 /// Steps that refine the pose of one held-out view, and its first rates (3R-GS: 100 steps, decay to 1 %).
@@ -60,6 +63,8 @@ pub struct SplatMap {
     n_steps: u64,
     n_given_up: usize,
     loss_curve: Vec<(u64, f64)>,
+    /// Steps between points of the curve.
+    note_every: u64,
 }
 
 impl std::fmt::Debug for SplatMap {
@@ -91,6 +96,7 @@ impl SplatMap {
             n_steps: 0,
             n_given_up: 0,
             loss_curve: Vec::new(),
+            note_every: FIRST_NOTE_EVERY,
         }
     }
 
@@ -134,11 +140,11 @@ impl SplatMap {
             if may_change && self.n_steps.is_multiple_of(RESEED_EVERY) {
                 self.reseed(phase);
             }
-            if self.n_steps.is_multiple_of(PRUNE_EVERY) {
+            if self.n_steps.is_multiple_of(self.note_every) {
                 self.note_loss();
-                if may_change {
-                    self.prune();
-                }
+            }
+            if may_change && self.n_steps.is_multiple_of(PRUNE_EVERY) {
+                self.prune();
             }
         }
         n
@@ -350,6 +356,15 @@ impl SplatMap {
         let stats = self.engine.take_stats();
         if stats.n_steps > 0 {
             self.loss_curve.push((self.n_steps, stats.loss));
+        }
+        // A live run has no end: half the points at twice the distance show the same curve.
+        if self.loss_curve.len() > MAX_CURVE {
+            let mut odd = false;
+            self.loss_curve.retain(|_| {
+                odd = !odd;
+                odd
+            });
+            self.note_every *= 2;
         }
     }
 }

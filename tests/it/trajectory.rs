@@ -6,7 +6,9 @@ use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use splat_mapper::clock::Stamp;
-use splat_mapper::eval::trajectory::{TOLERANCE_SECS, TimedPose, associate, format_tum, parse_tum};
+use splat_mapper::eval::trajectory::{
+    TOLERANCE_SECS, TimedPose, associate, format_tum, parse_tum, shifted, stamp_offset_nanos,
+};
 use splat_mapper::pose::Rigid;
 
 #[test]
@@ -140,7 +142,6 @@ fn damaged_files_end_in_poses_or_an_error_never_a_panic() {
 
 #[test]
 fn a_recording_with_an_epoch_of_its_own_still_meets_its_reference() {
-    use splat_mapper::eval::trajectory::{TOLERANCE_SECS, shifted, stamp_offset_nanos};
     let at = |i: i64| TimedPose {
         stamp: Stamp::from_nanos(100_000_000 * i),
         pose: Rigid::IDENTITY,
