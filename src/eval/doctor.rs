@@ -176,7 +176,7 @@ fn vulkan_loader(folders: &[PathBuf]) -> Check {
         Some(path) => Check::ok("vulkan", path.display().to_string()),
         None => Check::optional(
             "vulkan",
-            "no libvulkan.so.1; needed for --backend wgpu, else the cpu engine maps",
+            "no libvulkan.so.1; this version maps on the CPU and needs none, a later --backend wgpu will",
             "sudo apt install libvulkan1",
         ),
     }
@@ -197,7 +197,7 @@ fn vulkan_driver(icd_files: &[PathBuf]) -> Check {
         let fix = "sudo apt install mesa-vulkan-drivers (AMD, Intel, tests) or the driver of the GPU's maker";
         return Check::optional(
             "vulkan driver",
-            "none; needed for --backend wgpu and for the shader tests",
+            "none; this version maps on the CPU and needs none, a later --backend wgpu will",
             fix,
         );
     }
@@ -222,12 +222,12 @@ fn ros2(distro: Option<String>, root: &Path) -> Check {
     match entries(root).first() {
         Some(installed) => Check::optional(
             "ros 2",
-            "installed, not sourced; needed for ros2: sources and topics",
+            "installed, not sourced; this version reads recordings and speaks zenoh, a later one ROS 2 too",
             format!("source {}/setup.bash", installed.display()),
         ),
         None => Check::optional(
             "ros 2",
-            "none; needed for ros2: sources and topics only, recordings and zenoh work without",
+            "none; this version reads recordings and speaks zenoh, a later one ROS 2 too",
             "install a ROS 2 distribution (docs.ros.org) and source its setup.bash",
         ),
     }
@@ -243,7 +243,7 @@ fn cameras(dev: &Path) -> Check {
         let fix = "plug a camera in; in a container, pass it on with --device /dev/video0";
         return Check::optional(
             "camera",
-            "no /dev/video*; needed for v4l2: and webcam: sources",
+            "no /dev/video*; this version reads recordings, a later one cameras too",
             fix,
         );
     }
@@ -285,7 +285,7 @@ fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
         Some(path) => Check::ok("onnx runtime", path.display().to_string()),
         None => Check::optional(
             "onnx runtime",
-            "none; needed for --geometry onnx:FILE, sfm works without",
+            "none; this version uses --geometry sfm, a later one onnx:FILE too",
             FIX,
         ),
     }

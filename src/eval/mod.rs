@@ -16,6 +16,7 @@ pub mod render;
 pub mod report;
 pub mod trajectory;
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, thiserror::Error)]
@@ -107,17 +108,6 @@ fn read_text(what: &'static str, max_bytes: u64, path: &Path) -> Result<String, 
 
 /// Writes beside the target, then renames: a reader sees the old file or the whole new one, a full disk leaves the old.
 pub fn write_atomically(what: &'static str, bytes: &[u8], path: &Path) -> Result<(), EvalError> {
-    use std::io::Write;
-
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let partial = path.with_file_name(name);
-    let written = std::fs::File::create(&partial)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
-        .and_then(|()| std::fs::rename(&partial, path));
-    written.map_err(|e| {
-        // Nothing more can be done about the remains; the first error is the one to tell.
-        std::fs::remove_file(&partial).ok();
-        EvalError::writing(what, &e, path)
-    })
+    crate::atomic::write_file(path, |file| file.write_all(bytes))
+        .map_err(|e| EvalError::writing(what, &e, path))
 }
