@@ -64,6 +64,23 @@ pub struct DepthMap {
     pub confidence: Vec<f32>,
 }
 
+impl DepthMap {
+    /// Median of the verified depths; `None` where there are none.
+    pub fn median(&self) -> Option<f32> {
+        let usable = self
+            .depth
+            .iter()
+            .zip(&self.confidence)
+            .filter(|(d, c)| **c > 0.0 && **d > 0.0 && d.is_finite());
+        let mut values: Vec<f32> = usable.map(|(d, _)| *d).collect();
+        if values.is_empty() {
+            return None;
+        }
+        let middle = values.len() / 2;
+        Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
+}
+
 impl std::fmt::Debug for DepthMap {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "DepthMap({}x{})", self.width_px, self.height_px)

@@ -24,7 +24,7 @@ pub struct Report {
     pub steps: u64,
     pub adapter: String,
     pub seed: u64,
-    /// Of `map.ply`, in hexadecimal; empty when there is no map.
+    /// Of the splats as `map::layout` orders their bytes, in hexadecimal.
     pub map_sha256: String,
     pub timing_s: Timing,
     pub steps_per_s: Option<f64>,

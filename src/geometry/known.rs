@@ -39,7 +39,7 @@ impl Known {
             .ok_or_else(|| missing("a depth picture of equal stamp"))?;
         // One stream of numbers per keyframe: a shared keyframe gets the same noise in every batch.
         let mut rng = Pcg64Mcg::seed_from_u64(self.seed ^ (u64::from(keyframe.id) << 20));
-        let median = median_depth(depth);
+        let median = depth.median().map_or(1.0, f64::from);
         let angle = self.params.rotation_noise_deg.to_radians();
         let mut normal3 =
             |std: f64| DVec3::new(normal(&mut rng), normal(&mut rng), normal(&mut rng)) * std;
@@ -88,20 +88,6 @@ fn noisy_depth(depth: &DepthMap, std: f32, rng: &mut Pcg64Mcg) -> DepthMap {
         }
     }
     noisy
-}
-
-fn median_depth(depth: &DepthMap) -> f64 {
-    let mut valid: Vec<f32> = depth
-        .depth
-        .iter()
-        .copied()
-        .filter(|d| *d > 0.0 && d.is_finite())
-        .collect();
-    if valid.is_empty() {
-        return 1.0;
-    }
-    let middle = valid.len() / 2;
-    f64::from(*valid.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 /// Standard normal (Box and Muller 1958).

@@ -19,8 +19,9 @@ pub struct Placed {
     /// The picture that is trained on, and its camera.
     pub image: Arc<RgbImage>,
     pub intrinsics: Intrinsics,
-    /// In map units.
+    /// In map units, and its median.
     pub depth: Arc<DepthMap>,
+    pub median_depth: Option<f32>,
     pub health: Health,
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,
@@ -37,20 +38,18 @@ pub struct Keyframes {
 }
 
 impl Keyframes {
-    /// Remembers keyframes until they are placed. Returns how many had to be given up.
-    pub fn remember(&mut self, keyframes: &[Arc<Keyframe>], max_waiting: usize) -> usize {
+    /// Remembers keyframes until they are placed; beyond `max_waiting` the oldest are given up.
+    pub fn remember(&mut self, keyframes: &[Arc<Keyframe>], max_waiting: usize) {
         for keyframe in keyframes {
             if !self.placed.contains_key(&keyframe.id) {
                 self.waiting.insert(keyframe.id, Arc::clone(keyframe));
             }
         }
-        let n_given_up = self.waiting.len().saturating_sub(max_waiting);
-        for _ in 0..n_given_up {
+        while self.waiting.len() > max_waiting {
             if let Some((id, _)) = self.waiting.pop_first() {
                 self.foreign.remove(&id);
             }
         }
-        n_given_up
     }
 
     /// Number of keyframes per component other than the map's own.
@@ -78,19 +77,4 @@ pub fn rescaled(depth: &DepthMap, factor: f64) -> DepthMap {
         *value = (f64::from(*value) * factor) as f32;
     }
     depth
-}
-
-/// Median of the verified depths; `None` where there are none.
-pub fn median_depth(depth: &DepthMap) -> Option<f32> {
-    let usable = depth
-        .depth
-        .iter()
-        .zip(&depth.confidence)
-        .filter(|(d, c)| **c > 0.0 && **d > 0.0 && d.is_finite());
-    let mut values: Vec<f32> = usable.map(|(d, _)| *d).collect();
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }

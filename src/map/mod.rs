@@ -25,7 +25,7 @@ use crate::geometry::{GeometryBatch, View};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
 use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
-use crate::pose::Similarity;
+use crate::pose::{Rigid, Similarity};
 use crate::splat::{Engine, Rendering, StepSettings, TrainingView};
 
 /// Keyframes without a pose that are kept in case the model places them later.
@@ -61,7 +61,6 @@ pub struct SplatMap {
     epoch: u32,
     revision: u32,
     n_steps: u64,
-    n_given_up: usize,
     loss_curve: Vec<(u64, f64)>,
     /// Steps between points of the curve.
     note_every: u64,
@@ -94,7 +93,6 @@ impl SplatMap {
             epoch: 0,
             revision: 0,
             n_steps: 0,
-            n_given_up: 0,
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
         }
@@ -109,7 +107,7 @@ impl SplatMap {
         progress: Option<f64>,
     ) -> Vec<u32> {
         if let Some(batch) = batch {
-            self.n_given_up += self.keyframes.remember(&batch.keyframes, MAX_WAITING);
+            self.keyframes.remember(&batch.keyframes, MAX_WAITING);
         }
         self.revise(&geometry);
         let mut own = Vec::new();
@@ -240,6 +238,10 @@ impl SplatMap {
             .collect()
     }
 
+    pub fn n_keyframes(&self) -> usize {
+        self.keyframes.placed.len()
+    }
+
     pub fn has_keyframe(&self, keyframe_id: u32) -> bool {
         self.keyframes.placed.contains_key(&keyframe_id)
     }
@@ -250,11 +252,6 @@ impl SplatMap {
 
     pub fn n_steps(&self) -> u64 {
         self.n_steps
-    }
-
-    /// Keyframes that stayed without a pose so long that they were let go.
-    pub fn n_given_up(&self) -> usize {
-        self.n_given_up
     }
 
     pub fn adapter(&self) -> String {
@@ -287,16 +284,17 @@ impl SplatMap {
             return Vec::new();
         }
         let map_poses = self.engine.poses();
-        let map_from_model =
-            align::align(&self.keyframes.pose_pairs(&map_poses)).unwrap_or(Similarity::IDENTITY);
+        let map_from_model = self.map_from_model(&map_poses);
         let mut fresh = Vec::new();
         for view in views {
             let depth = Arc::new(keyframes::rescaled(&view.depth, map_from_model.scale));
+            let median_depth = depth.median();
             if let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) {
                 // A shared keyframe: more neighbours have verified its depth since.
                 self.engine
                     .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
-                (placed.depth, placed.health) = (depth, view.health);
+                (placed.depth, placed.median_depth) = (depth, median_depth);
+                placed.health = view.health;
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
                 let image = Arc::new(keyframe.frame.image.shrunk(self.params.max_side));
                 let intrinsics = view.intrinsics.resized(image.width_px, image.height_px);
@@ -321,6 +319,7 @@ impl SplatMap {
                         image,
                         intrinsics,
                         depth,
+                        median_depth,
                         health: view.health,
                         is_held_out,
                     },
@@ -339,12 +338,17 @@ impl SplatMap {
         fresh
     }
 
+    /// From the poses that the model gave to where the same cameras stand; `map_poses` by view index.
+    fn map_from_model(&self, map_poses: &[Rigid]) -> Similarity {
+        align::align(&self.keyframes.pose_pairs(map_poses)).unwrap_or(Similarity::IDENTITY)
+    }
+
     fn measure_scene(&mut self) {
         let mut medians: Vec<f32> = self
             .keyframes
             .placed
             .values()
-            .filter_map(|p| keyframes::median_depth(&p.depth))
+            .filter_map(|p| p.median_depth)
             .collect();
         medians.sort_by(f32::total_cmp);
         if let Some(median) = medians.get(medians.len() / 2) {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::geometry::{GeometryBatch, View};
 use crate::map::{SplatMap, align, keyframes};
-use crate::pose::{Rigid, Similarity};
+use crate::pose::Rigid;
 
 /// A component of at least this many keyframes, and this many times as large as the map's, takes the map's place.
 const MIN_TAKEOVER: usize = 8;
@@ -15,16 +15,18 @@ const MIN_REVISION: f64 = 5e-4;
 impl SplatMap {
     /// Cameras that the model moved: their refined poses and the splats seeded from them move along.
     pub(super) fn revise(&mut self, geometry: &GeometryBatch) {
+        if geometry.revised.is_empty() {
+            return;
+        }
         let map_poses = self.engine.poses();
-        let map_from_model =
-            align::align(&self.keyframes.pose_pairs(&map_poses)).unwrap_or(Similarity::IDENTITY);
+        let map_from_model = self.map_from_model(&map_poses);
         let mut motions = BTreeMap::new();
         let mut joined = Vec::new();
         for (id, component, model_from_cam) in &geometry.revised {
-            if let Some(view) = self.keyframes.foreign.get(id) {
+            if let Some(view) = self.keyframes.foreign.get_mut(id) {
                 if Some(*component) == self.component {
                     joined.push((view.component, *id, *model_from_cam));
-                } else if let Some(view) = self.keyframes.foreign.get_mut(id) {
+                } else {
                     (view.component, view.batch_from_cam) = (*component, *model_from_cam);
                 }
                 continue;
@@ -58,29 +60,27 @@ impl SplatMap {
 
     /// Views of another component whose poses the model has linked to ours: (old component, id, pose in our frame).
     fn join(&mut self, joined: &[(u32, u32, Rigid)]) {
-        let mut views: Vec<View> = Vec::new();
+        let mut pairs: BTreeMap<u32, Vec<(Rigid, Rigid)>> = BTreeMap::new();
         for (component, id, pose) in joined {
-            let pairs: Vec<(Rigid, Rigid)> = joined
-                .iter()
-                .filter(|(other, ..)| other == component)
-                .filter_map(|(_, id, pose)| {
-                    Some((*pose, self.keyframes.foreign.get(id)?.batch_from_cam))
-                })
-                .collect();
-            let factor = align::align(&pairs).map_or(1.0, |similarity| similarity.scale);
             if let Some(view) = self.keyframes.foreign.get(id) {
-                let depth = keyframes::rescaled(&view.depth, factor);
-                let component = self.component.unwrap_or(view.component);
-                views.push(View {
-                    depth,
-                    component,
-                    batch_from_cam: *pose,
-                    ..view.clone()
-                });
+                let pair = (*pose, view.batch_from_cam);
+                pairs.entry(*component).or_default().push(pair);
             }
         }
-        for view in &views {
-            self.keyframes.foreign.remove(&view.keyframe_id);
+        let mut views = Vec::new();
+        for (component, id, pose) in joined {
+            let factor = pairs
+                .get(component)
+                .and_then(|pairs| align::align(pairs))
+                .map_or(1.0, |similarity| similarity.scale);
+            if let Some(view) = self.keyframes.foreign.remove(id) {
+                views.push(View {
+                    depth: keyframes::rescaled(&view.depth, factor),
+                    component: self.component.unwrap_or(view.component),
+                    batch_from_cam: *pose,
+                    ..view
+                });
+            }
         }
         self.place(views, None);
     }

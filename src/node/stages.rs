@@ -220,7 +220,7 @@ impl MapStage {
         &mut self,
         publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
     ) -> bool {
-        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.keyframe_ids().len() as u64;
+        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
         let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
         self.step_until(target, publish);
@@ -234,14 +234,8 @@ impl MapStage {
     ) -> Arc<Snapshot> {
         let watch = Stopwatch::start();
         let (first, last) = (self.map.n_steps(), self.params.steps);
-        while !self.stop.is_asked() && self.map.n_steps() < last {
-            let share = (self.map.n_steps() - first) as f32 / (last - first) as f32;
-            let n = STEPS_AT_ONCE.min(last - self.map.n_steps());
-            if self.map.step(n, Phase::Final(share)) == 0 {
-                break;
-            }
-            self.snapshot_if_due(publish);
-        }
+        let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
+        self.make_steps(last, &phase, publish);
         if !self.stop.is_asked() {
             self.map.refine_held_out();
         }
@@ -253,15 +247,25 @@ impl MapStage {
 
     fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
         let watch = Stopwatch::start();
+        self.make_steps(target, &|_| Phase::Streaming, publish);
+        self.optimise_secs += watch.secs();
+        self.snapshot_if_due(publish);
+    }
+
+    /// Steps up to `target`, as long as nobody asks to stop; `phase` of the steps made so far.
+    fn make_steps(
+        &mut self,
+        target: u64,
+        phase: &dyn Fn(u64) -> Phase,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) {
         while self.map.n_steps() < target && !self.stop.is_asked() {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
-            if self.map.step(n, Phase::Streaming) == 0 {
+            if self.map.step(n, phase(self.map.n_steps())) == 0 {
                 break;
             }
             self.snapshot_if_due(publish);
         }
-        self.optimise_secs += watch.secs();
-        self.snapshot_if_due(publish);
     }
 
     fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
@@ -289,7 +293,7 @@ impl MapStage {
     fn progress(&self) -> Progress {
         Progress {
             n_keyframes: self.n_keyframes,
-            n_placed: self.map.keyframe_ids().len(),
+            n_placed: self.map.n_keyframes(),
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
             steps_planned: if self.is_live { 0 } else { self.params.steps },

@@ -89,6 +89,12 @@ impl<'a> Rows<'a> {
         })
     }
 
+    /// Rows of packed pixels, as many as the picture is high.
+    fn of_pixels(image: &'a Image, bytes_per_px: u64) -> Result<Self, DecodeError> {
+        let row_bytes = u64::from(image.width) * bytes_per_px;
+        Self::of(image, row_bytes, u64::from(image.height))
+    }
+
     fn iter(&self) -> impl Iterator<Item = &'a [u8]> {
         let (step, row_bytes) = (self.step, self.row_bytes);
         let data = self.data;
@@ -107,16 +113,8 @@ impl<'a> Rows<'a> {
 
 /// A raw picture as RGB. Names are those of `sensor_msgs/image_encodings.hpp` and of V4L2 drivers.
 pub fn raw(image: &Image) -> Result<RgbImage, DecodeError> {
-    check_size(image, "1 to 16384 px a side", |w, h| {
-        w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE
-    })?;
-    let rows = |bytes_per_px: u64| {
-        Rows::of(
-            image,
-            u64::from(image.width) * bytes_per_px,
-            u64::from(image.height),
-        )
-    };
+    check_sides(image)?;
+    let rows = |bytes_per_px| Rows::of_pixels(image, bytes_per_px);
     let pixels = match image.encoding.as_str() {
         "rgb8" => rows(3)?.map(|&[r, g, b]| [r, g, b]),
         "bgr8" | "8UC3" => rows(3)?.map(|&[b, g, r]| [r, g, b]),
@@ -187,16 +185,8 @@ pub fn compressed(bytes: &[u8]) -> Result<RgbImage, DecodeError> {
 
 /// Depth in metres; 0 where the sensor had none. Exact by agreement, so confidence is 1 wherever there is a value.
 pub fn depth(image: &Image) -> Result<DepthMap, DecodeError> {
-    check_size(image, "1 to 16384 px a side", |w, h| {
-        w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE
-    })?;
-    let rows = |bytes_per_px: u64| {
-        Rows::of(
-            image,
-            u64::from(image.width) * bytes_per_px,
-            u64::from(image.height),
-        )
-    };
+    check_sides(image)?;
+    let rows = |bytes_per_px| Rows::of_pixels(image, bytes_per_px);
     let is_big = image.is_bigendian != 0;
     let depth: Vec<f32> = match image.encoding.as_str() {
         "16UC1" | "mono16" => {
@@ -264,6 +254,12 @@ fn depth_or_none(metres: f32) -> f32 {
     } else {
         0.0
     }
+}
+
+fn check_sides(image: &Image) -> Result<(), DecodeError> {
+    check_size(image, "1 to 16384 px a side", |w, h| {
+        w > 0 && h > 0 && w <= MAX_SIDE && h <= MAX_SIDE
+    })
 }
 
 fn check_size(

@@ -182,6 +182,18 @@ impl MvsState {
         worst
     }
 
+    /// Of the depth map. `None`: not held.
+    pub fn intrinsics(&self, keyframe_id: u32) -> Option<Intrinsics> {
+        Some(self.held.get(&keyframe_id)?.prepared.intrinsics)
+    }
+
+    /// That the last sweep had; 0 for one that was never swept or is not held.
+    pub fn n_sources(&self, keyframe_id: u32) -> usize {
+        self.held
+            .get(&keyframe_id)
+            .map_or(0, |held| held.sources.len())
+    }
+
     pub fn holds(&self, keyframe_id: u32) -> bool {
         self.held.contains_key(&keyframe_id)
     }

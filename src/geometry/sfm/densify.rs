@@ -1,16 +1,14 @@
 //! Placed keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
 
-use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::report::{SparseBatch, SparseView};
-use crate::camera::Intrinsics;
 use crate::config::MvsParams;
 use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::mvs::MvsView;
 use crate::geometry::mvs::neighbours::depth_range;
 use crate::geometry::mvs::state::MvsState;
 use crate::geometry::{GeometryBatch, View};
-use std::sync::Arc;
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 96;
@@ -22,9 +20,6 @@ const MAX_DRIFT_PX: f64 = 1.0;
 pub(super) struct Densifier {
     params: MvsParams,
     state: MvsState,
-    intrinsics: BTreeMap<u32, Intrinsics>,
-    /// Sources that the last sweep of a keyframe had.
-    n_sources: BTreeMap<u32, usize>,
 }
 
 impl Densifier {
@@ -32,8 +27,6 @@ impl Densifier {
         Self {
             params: params.clone(),
             state: MvsState::new(params.clone(), MAX_HELD),
-            intrinsics: BTreeMap::new(),
-            n_sources: BTreeMap::new(),
         }
     }
 
@@ -44,8 +37,8 @@ impl Densifier {
         image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
     ) -> GeometryBatch {
         for (id, _, pose) in &sparse.revised {
-            if let Some(intrinsics) = self.intrinsics.get(id) {
-                self.state.revise(*id, *intrinsics, *pose);
+            if let Some(intrinsics) = self.state.intrinsics(*id) {
+                self.state.revise(*id, intrinsics, *pose);
             }
         }
         // All pictures first: the views of one batch are each other's best sources.
@@ -66,7 +59,6 @@ impl Densifier {
 
     fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
         let (id, world_from_cam) = (view.keyframe_id, view.batch_from_cam);
-        self.intrinsics.insert(id, view.intrinsics);
         if self.state.holds(id) {
             self.state.revise(id, view.intrinsics, world_from_cam);
         } else if let Some(image) = image_of(id) {
@@ -82,10 +74,6 @@ impl Densifier {
                 &[],
             );
         }
-        while self.intrinsics.len() > MAX_HELD {
-            self.intrinsics.pop_first();
-            self.n_sources.pop_first();
-        }
     }
 
     /// Sweeps a new view, and one swept before when it had too few sources or its camera has moved.
@@ -98,7 +86,7 @@ impl Densifier {
             .filter(|n| self.state.holds(*n))
             .collect();
         let n_sources = neighbours.len().min(self.params.n_sources);
-        let is_current = self.n_sources.get(&id).is_some_and(|had| *had >= n_sources)
+        let is_current = self.state.n_sources(id) >= n_sources
             && self
                 .state
                 .drift_px(id)
@@ -114,7 +102,6 @@ impl Densifier {
             return;
         };
         self.state.resweep(id, near, far, &neighbours);
-        self.n_sources.insert(id, n_sources);
     }
 
     fn view(&self, view: &SparseView) -> View {

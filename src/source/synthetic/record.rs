@@ -5,15 +5,16 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::fs::{self, File};
-use std::io::{BufWriter, Seek, Write};
-use std::path::{Path, PathBuf};
+use std::fs;
+use std::io::{Seek, Write};
+use std::path::Path;
 
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use mcap::records::MessageHeader;
 use serde::Serialize;
 
+use crate::atomic::write_file;
 use crate::camera::{Distortion, Lens};
 use crate::frame::DepthMap;
 use crate::ros::{
@@ -50,20 +51,6 @@ pub fn write_recording_with(
     mut on_frame: impl FnMut(u32),
 ) -> Result<SynthSummary, SynthError> {
     let take = Take::new(settings.clone())?;
-    let part = with_suffix(out, "part");
-    let written = record(&take, &part, &mut on_frame);
-    let n_messages = match written {
-        Ok(n_messages) => n_messages,
-        Err(reason) => {
-            // The half file is of no use; that it cannot be removed either says nothing new.
-            fs::remove_file(&part).ok();
-            return Err(SynthError::Write {
-                what: "write",
-                reason,
-                path: out.to_owned(),
-            });
-        }
-    };
     let failed = |what: &'static str, path: &Path| {
         let path = path.to_owned();
         move |e: std::io::Error| SynthError::Write {
@@ -72,7 +59,12 @@ pub fn write_recording_with(
             path,
         }
     };
-    fs::rename(&part, out).map_err(failed("rename", out))?;
+    let mut n_messages = 0;
+    write_file(out, |file| {
+        n_messages = record(&take, file, &mut on_frame).map_err(std::io::Error::other)?;
+        Ok(())
+    })
+    .map_err(failed("write", out))?;
     let tum = out.with_extension("tum");
     fs::write(&tum, tum_lines(&take)).map_err(failed("write the poses beside", &tum))?;
     let bytes = fs::metadata(out).map_err(failed("read back", out))?.len();
@@ -104,13 +96,6 @@ fn tum_lines(take: &Take) -> String {
         .expect("a String takes everything");
     }
     lines
-}
-
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".");
-    name.push(suffix);
-    path.with_file_name(name)
 }
 
 /// One topic of the file under way.
@@ -163,8 +148,11 @@ impl<W: Write + Seek> Recorder<W> {
     }
 }
 
-fn record(take: &Take, path: &Path, on_frame: &mut impl FnMut(u32)) -> Result<u64, String> {
-    let file = BufWriter::new(File::create(path).map_err(|e| e.to_string())?);
+fn record(
+    take: &Take,
+    file: impl Write + Seek,
+    on_frame: &mut impl FnMut(u32),
+) -> Result<u64, String> {
     let options = mcap::WriteOptions::new()
         .profile("ros2")
         .library(concat!("splat-mapper ", env!("CARGO_PKG_VERSION")))
@@ -233,11 +221,7 @@ fn record(take: &Take, path: &Path, on_frame: &mut impl FnMut(u32)) -> Result<u6
         on_frame(ix + 1);
     }
     out.file.finish().map_err(|e| e.to_string())?;
-    let n_messages = out.n_messages;
-    let mut file = out.file.into_inner();
-    file.flush().map_err(|e| e.to_string())?;
-    file.get_ref().sync_all().map_err(|e| e.to_string())?;
-    Ok(n_messages)
+    Ok(out.n_messages)
 }
 
 fn jpeg(take: &Take, ix: u32) -> Result<Vec<u8>, String> {
