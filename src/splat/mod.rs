@@ -4,6 +4,12 @@
 //! the numbers live: a step returns nothing, statistics arrive later, read-backs are explicit and rare.
 
 pub mod cpu;
+pub mod epipolar;
+pub mod gradients;
+pub mod mcmc;
+pub mod refiner;
+pub mod sh_rotation;
+pub mod wgpu;
 
 use std::sync::Arc;
 
@@ -36,10 +42,67 @@ pub struct TrainingView {
     pub cam_from_map: Rigid,
     /// In map units; guides the depth loss where confidence > 0. May be smaller than the image.
     pub depth: Option<Arc<DepthMap>>,
+    /// Weight of each pixel in the photometric loss, 255 = all; what moves gets less. `None`: all count.
+    pub mask: Option<Arc<[u8]>>,
 }
 
-/// Numbers of one step; the map's schedule sets them.
-#[derive(Debug, Clone, PartialEq)]
+/// What the depth loss compares. Equations: docs/GRADIENTS.md, losses.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum DepthMode {
+    /// Relative error of inverse expected depth, Huber, weighted by confidence.
+    #[default]
+    InverseDepth,
+    /// Expected depth and inverted inverse depth, each stretched to 0..1 over the picture (FastSplatting, code).
+    PaperCode,
+    /// Alpha and depth, each stretched to 0..1 over the picture (FastSplatting, text).
+    PaperAlpha,
+}
+
+/// How a step may move the view's pose.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum PoseStep {
+    #[default]
+    Held,
+    /// The view's own increment of six numbers.
+    Direct,
+    /// The network that all views share (3R-GS).
+    Shared,
+}
+
+/// The network that moves all poses together; see `refiner`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefinerSettings {
+    pub seed: u64,
+    /// Map units that an output of 1 moves a camera by: RMS distance of the cameras to their mean.
+    pub camera_scale: f32,
+}
+
+/// One pass of MCMC moves (Kheradmand et al. 2024).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct McmcSettings {
+    /// Splats of at most this opacity are dead and move to live ones.
+    pub min_opacity: f32,
+    /// Splats that there may be in all.
+    pub max_splats: usize,
+    /// Count after growth as a multiple of the count before, 1.05 in the paper; 1: none are added.
+    pub growth: f32,
+    /// Only splats that one of the last so many steps has seen take part; 0: all.
+    pub active_steps: u32,
+    /// Different in every pass.
+    pub seed: u32,
+}
+
+/// A point seen in two views: pixels of the training pictures.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    pub own_px: [f32; 2],
+    pub other_view_ix: u32,
+    pub other_px: [f32; 2],
+    pub weight: f32,
+}
+
+/// Numbers of one step; the map's schedule sets them. The default changes nothing.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct StepSettings {
     pub lr_mean: f32,
     pub lr_scale: f32,
@@ -53,16 +116,31 @@ pub struct StepSettings {
     pub lr_pose_translation: f32,
     /// Share of 1 - SSIM in the photometric loss; the rest is L1.
     pub ssim_weight: f32,
-    /// Weight of the inverse depth loss; 0 turns it off.
+    /// Adam rate of the shared network and of the views' embeddings.
+    pub lr_refiner: f32,
+    /// Adam rate of the logarithm of the factor on all focal lengths; 0 holds it.
+    pub lr_focal: f32,
+    /// Adam rate of the view's gain and offset per channel; 0 holds them.
+    pub lr_exposure: f32,
+    /// Weight of the depth loss; 0 turns it off.
     pub depth_weight: f32,
+    pub depth_mode: DepthMode,
+    /// Weight of the symmetric epipolar distance, in px, over the view's matches; 0 turns it off.
+    pub epipolar_weight: f32,
     /// Weights of mean opacity and mean scale over the visible splats (3DGS-MCMC regularisers).
     pub opacity_reg: f32,
     pub scale_reg: f32,
+    /// Rate of SGLD noise on the means: `lr_mean` times 5e5 in the paper; 0 turns it off.
+    pub noise: f32,
+    /// Of the noise, with the number of the step and of the splat.
+    pub noise_seed: u32,
     /// SH bands above this degree are neither used nor trained.
     pub sh_degree: u8,
-    /// false: the splats are frozen and only the view's pose moves (test-time refinement).
+    /// Band b of a splat is trained from its `b * sh_interval`-th update on; 0: at once.
+    pub sh_interval: u32,
+    /// false: the splats are frozen and only the view's pose and exposure move (test-time refinement).
     pub train_splats: bool,
-    pub train_pose: bool,
+    pub pose: PoseStep,
 }
 
 /// Means over the steps since it was last taken.
@@ -104,11 +182,26 @@ pub trait Engine: Send {
     /// Returns the index of the view.
     fn add_view(&mut self, view: TrainingView) -> usize;
 
-    /// Replaces a view's pose and clears its optimiser state.
+    /// Replaces a view's pose and clears its own optimiser state; the shared network stays as it is.
     fn set_pose(&mut self, view_ix: usize, cam_from_map: Rigid);
+
+    /// Replaces a view's intrinsics, of the same picture; the factor on all focal lengths stays.
+    fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics);
+
+    /// Begins with a fresh network; what the old one did to the poses stays in them.
+    fn start_refiner(&mut self, settings: &RefinerSettings);
 
     /// Replaces the depth that guides a view's depth loss.
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>);
+
+    /// Replaces the weights of a view's pixels.
+    fn set_mask(&mut self, view_ix: usize, mask: Option<Arc<[u8]>>);
+
+    /// Replaces the matches between a view and others.
+    fn set_matches(&mut self, view_ix: usize, matches: &[Match]);
+
+    /// Moves dead splats to live ones and adds some, so that the picture stays the same. Returns the count.
+    fn relocate_and_grow(&mut self, settings: &McmcSettings) -> usize;
 
     /// One optimiser update on one view. Reads nothing back; a view that sees no splat changes nothing.
     fn step(&mut self, view_ix: usize, settings: &StepSettings);
@@ -118,6 +211,20 @@ pub trait Engine: Send {
 
     /// Waits for all steps and reads all refined poses back, by view index.
     fn poses(&mut self) -> Vec<Rigid>;
+
+    /// Waits for all steps and reads the factor on all focal lengths back.
+    fn focal_factor(&mut self) -> f64;
+
+    /// Waits for all steps and reads back each view's log gain and offset of r, g, b.
+    fn exposures(&mut self) -> Vec<[[f32; 3]; 2]>;
+
+    /// What has broken for good, a lost device for example; from then on steps do nothing.
+    fn fault(&self) -> Option<String> {
+        None
+    }
+
+    /// Most bytes that the buffers on a GPU have held; 0 on the CPU.
+    fn peak_gpu_bytes(&self) -> u64;
 
     /// Waits for all steps and reads the splats back.
     fn splats(&mut self) -> Splats;

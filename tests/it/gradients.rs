@@ -1,223 +1,44 @@
-//! The twin's gradients against central differences, and the backends' against the twin's.
+//! The twin's gradients against central differences.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
+use splat_mapper::splat::DepthMode;
 
-use glam::DVec3;
-use splat_mapper::pose::Rigid;
-
+use crate::reference::differences::{ARRAYS, Problem, flat};
 use crate::reference::random::{self, Recipe, SMALL, Scene};
-use crate::reference::{
-    Camera, Gradients, Params, Target, Weights, bin, gradients, project, raster,
-};
+use crate::reference::{Gradients, Target, Weights, loss, project, raster};
 
-/// Truncation error is about STEP^2 times the third derivative over six, some 1e-8 of the gradient for splats
-/// wider than a pixel; rounding is 1e-16 / STEP.
-const STEP: f64 = 1e-5;
-const MAX_RELATIVE: f64 = 1e-5;
-/// Numbers far below the largest of their array are held against this share of it.
-const FLOOR: f64 = 1e-3;
-/// Share of parameters whose difference may span a jump and is then no derivative.
-const MAX_SKIPPED: f64 = 0.03;
-
-const ARRAYS: [&str; 6] = [
-    "means",
-    "log_scales",
-    "quats",
-    "opacity_logits",
-    "sh",
-    "pose",
-];
-
-const L1: Weights = Weights {
-    l1: 1.0,
-    ssim: 0.0,
-    depth: 0.0,
-    opacity: 0.0,
-    scale: 0.0,
-};
-const SSIM: Weights = Weights {
-    l1: 0.0,
-    ssim: 1.0,
-    depth: 0.0,
-    opacity: 0.0,
-    scale: 0.0,
-};
-const DEPTH: Weights = Weights {
+/// No term at all.
+const NONE: Weights = Weights {
     l1: 0.0,
     ssim: 0.0,
-    depth: 1.0,
+    depth: 0.0,
+    depth_mode: DepthMode::InverseDepth,
     opacity: 0.0,
     scale: 0.0,
+};
+const L1: Weights = Weights { l1: 1.0, ..NONE };
+const SSIM: Weights = Weights { ssim: 1.0, ..NONE };
+const DEPTH: Weights = Weights { depth: 1.0, ..NONE };
+const PAPER_CODE: Weights = Weights {
+    depth_mode: DepthMode::PaperCode,
+    ..DEPTH
+};
+const PAPER_ALPHA: Weights = Weights {
+    depth_mode: DepthMode::PaperAlpha,
+    ..DEPTH
 };
 const OPACITY: Weights = Weights {
-    l1: 0.0,
-    ssim: 0.0,
-    depth: 0.0,
     opacity: 1.0,
-    scale: 0.0,
+    ..NONE
 };
-const SCALE: Weights = Weights {
-    l1: 0.0,
-    ssim: 0.0,
-    depth: 0.0,
-    opacity: 0.0,
-    scale: 1.0,
-};
+const SCALE: Weights = Weights { scale: 1.0, ..NONE };
 const ALL: Weights = Weights {
     l1: 0.8,
     ssim: 0.2,
     depth: 0.3,
     opacity: 0.1,
     scale: 0.1,
+    ..NONE
 };
-
-/// Where the loss is taken.
-#[derive(Clone)]
-struct Point {
-    params: Params,
-    cam_from_map: Rigid,
-}
-
-struct Problem {
-    point: Point,
-    scene: Scene,
-    target: Target,
-    weights: Weights,
-    sh_degree: u8,
-}
-
-impl Problem {
-    fn new(scene: Scene, weights: Weights, sh_degree: u8) -> Self {
-        let point = Point {
-            params: Params::from(&scene.splats),
-            cam_from_map: scene.view.cam_from_map,
-        };
-        let target = Target::new(&scene.view);
-        Self {
-            point,
-            scene,
-            target,
-            weights,
-            sh_degree,
-        }
-    }
-
-    fn gradients(&self, point: &Point) -> Gradients {
-        let camera = Camera::new(&self.scene.view.intrinsics, &point.cam_from_map);
-        gradients(
-            &point.params,
-            &camera,
-            &self.target,
-            &self.weights,
-            self.sh_degree,
-        )
-    }
-
-    /// Everything that is decided and not computed. Between two points with equal decisions the loss is smooth.
-    fn decisions(&self, point: &Point, result: &Gradients) -> u64 {
-        let camera = Camera::new(&self.scene.view.intrinsics, &point.cam_from_map);
-        let projected = project::project(&point.params, &camera, self.sh_degree);
-        let mut hasher = DefaultHasher::new();
-        bin::order(&projected).hash(&mut hasher);
-        for splat in &projected {
-            (splat.splat_ix, splat.is_clamped, splat.is_dark).hash(&mut hasher);
-        }
-        for (pixel, hits) in result.raster.hits.iter().enumerate() {
-            for hit in hits {
-                (hit.ix, hit.is_saturated).hash(&mut hasher);
-            }
-            let (wanted, alpha) = (self.target.depth[pixel].0, result.raster.alpha[pixel]);
-            (
-                alpha > 0.5,
-                huber_branch(wanted / result.raster.depth(pixel) - 1.0),
-            )
-                .hash(&mut hasher);
-        }
-        for (rendered, wanted) in result.raster.rgb.iter().zip(&self.target.rgb) {
-            (rendered > wanted).hash(&mut hasher);
-        }
-        hasher.finish()
-    }
-
-    /// Largest error of each array of `claimed`, relative, or what is wrong.
-    fn check(&self, claimed: &Gradients) -> Result<[f64; 6], String> {
-        let base = self.decisions(&self.point, &self.gradients(&self.point));
-        let (mut n_skipped, mut n_all) = (0, 0);
-        let mut worst = [0.0; 6];
-        for (array_ix, array) in ARRAYS.into_iter().enumerate() {
-            let claimed = flat(claimed, array_ix);
-            let numeric: Vec<Option<f64>> = (0..claimed.len())
-                .map(|k| {
-                    let [low, high] = [-STEP, STEP].map(|h| self.point.moved(array_ix, k, h));
-                    let [at_low, at_high] = [&low, &high].map(|point| self.gradients(point));
-                    let is_smooth = self.decisions(&low, &at_low) == base
-                        && self.decisions(&high, &at_high) == base;
-                    is_smooth.then(|| (at_high.loss.total - at_low.loss.total) / (2.0 * STEP))
-                })
-                .collect();
-            n_all += numeric.len();
-            n_skipped += numeric.iter().filter(|n| n.is_none()).count();
-            let largest = numeric
-                .iter()
-                .flatten()
-                .fold(0.0, |max: f64, n| max.max(n.abs()));
-            for (k, (claim, numeric)) in claimed.iter().zip(&numeric).enumerate() {
-                let Some(numeric) = numeric else { continue };
-                // Rounding of the loss alone moves a vanishing array by so much.
-                let error = (claim - numeric).abs() / numeric.abs().max(FLOOR * largest).max(1e-7);
-                if error.is_nan() || error > MAX_RELATIVE {
-                    return Err(format!(
-                        "{array}[{k}]: claimed {claim:e}, differences say {numeric:e}"
-                    ));
-                }
-                worst[array_ix] = error.max(worst[array_ix]);
-            }
-        }
-        if n_skipped as f64 > MAX_SKIPPED * n_all as f64 {
-            return Err(format!("{n_skipped} of {n_all} differences span a jump"));
-        }
-        Ok(worst)
-    }
-}
-
-fn huber_branch(error: f64) -> i8 {
-    if error.abs() <= 0.05 {
-        0
-    } else {
-        error.signum() as i8
-    }
-}
-
-impl Point {
-    fn moved(&self, array_ix: usize, k: usize, by: f64) -> Self {
-        let mut moved = self.clone();
-        match ARRAYS[array_ix] {
-            "means" => moved.params.means[k / 3][k % 3] += by,
-            "log_scales" => moved.params.log_scales[k / 3][k % 3] += by,
-            "quats" => moved.params.quats[k / 4][k % 4] += by,
-            "opacity_logits" => moved.params.opacity_logits[k] += by,
-            "sh" => moved.params.sh[k] += by,
-            _ => {
-                let mut delta = [0.0; 6];
-                delta[k] = by;
-                let [rho, theta] = [&delta[..3], &delta[3..]].map(DVec3::from_slice);
-                moved.cam_from_map = Rigid::exp(rho, theta) * self.cam_from_map;
-            }
-        }
-        moved
-    }
-}
-
-fn flat(gradients: &Gradients, array_ix: usize) -> Vec<f64> {
-    match ARRAYS[array_ix] {
-        "means" => gradients.splats.means.concat(),
-        "log_scales" => gradients.splats.log_scales.concat(),
-        "quats" => gradients.splats.quats.concat(),
-        "opacity_logits" => gradients.splats.opacity_logits.clone(),
-        "sh" => gradients.splats.sh.clone(),
-        _ => gradients.pose.to_vec(),
-    }
-}
 
 /// A random scene with one splat each that is held at the slope limit, saturated, and dark in one channel.
 fn eventful_scene(seed: u64, sh_degree: u8) -> Scene {
@@ -243,6 +64,8 @@ fn check_terms(sh_degree: u8, seed: u64) {
         ("l1", L1),
         ("ssim", SSIM),
         ("depth", DEPTH),
+        ("depth as in the paper's code", PAPER_CODE),
+        ("depth as in the paper's text", PAPER_ALPHA),
         ("opacity", OPACITY),
         ("scale", SCALE),
         ("all", ALL),
@@ -315,7 +138,8 @@ fn stopped_pixels(gradients: &Gradients) -> usize {
 
 #[test]
 fn a_sign_turned_anywhere_is_caught() {
-    let problem = Problem::new(eventful_scene(31, 1), ALL, 1);
+    let mut problem = Problem::new(eventful_scene(31, 1), ALL, 1);
+    problem.point.exposure = [[0.2, -0.1, 0.05], [0.03, -0.04, 0.02]];
     let honest = problem.gradients(&problem.point);
     problem.check(&honest).unwrap();
     for (array_ix, array) in ARRAYS.into_iter().enumerate() {
@@ -332,6 +156,8 @@ fn a_sign_turned_anywhere_is_caught() {
             "quats" => wrong.splats.quats[at / 4][at % 4] *= -1.0,
             "opacity_logits" => wrong.splats.opacity_logits[at] *= -1.0,
             "sh" => wrong.splats.sh[at] *= -1.0,
+            "exposure" => wrong.exposure[at / 3][at % 3] *= -1.0,
+            "log_focal" => wrong.log_focal *= -1.0,
             _ => wrong.pose[at] *= -1.0,
         }
         let verdict = problem.check(&wrong).unwrap_err();
@@ -344,7 +170,7 @@ fn the_scenes_of_these_tests_meet_every_special_case() {
     let mut met = [0; 4];
     for seed in 0..4 {
         let problem = Problem::new(eventful_scene(seed, 0), ALL, 0);
-        let camera = Camera::new(&problem.scene.view.intrinsics, &problem.point.cam_from_map);
+        let camera = problem.camera(&problem.point);
         let projected = project::project(&problem.point.params, &camera, 0);
         let result = problem.gradients(&problem.point);
         let hit = |ix: usize| result.raster.hits.iter().flatten().any(|hit| hit.ix == ix);
@@ -371,4 +197,77 @@ fn the_scenes_of_these_tests_meet_every_special_case() {
         met[3] += usize::from(result.loss.depth > 0.0);
     }
     assert!(met.iter().all(|&n| n >= 2), "{met:?}");
+}
+
+#[test]
+fn weighted_pixels_and_an_exposure_keep_the_gradients_right() {
+    for (name, weights) in [("l1", L1), ("ssim", SSIM), ("depth", DEPTH), ("all", ALL)] {
+        for seed in 60..62 {
+            let mut scene = eventful_scene(seed, 1);
+            scene.view.mask = Some(random::mask(seed, &scene.view.image));
+            let mut problem = Problem::new(scene, weights, 1);
+            problem.point.exposure = [[0.3, -0.2, 0.1], [-0.05, 0.1, 0.02]];
+            let claimed = problem.gradients(&problem.point);
+            if let Err(reason) = problem.check(&claimed) {
+                panic!("{name}, seed {seed}: {reason}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_picture_of_which_no_pixel_counts_has_no_loss_and_no_gradient() {
+    let mut scene = eventful_scene(63, 1);
+    let n_pixels = scene.view.image.pixels.len() / 3;
+    scene.view.mask = Some(vec![0; n_pixels].into());
+    let weights = Weights {
+        opacity: 0.0,
+        scale: 0.0,
+        ..ALL
+    };
+    let problem = Problem::new(scene, weights, 1);
+    let result = problem.gradients(&problem.point);
+    assert_eq!(result.loss.total, 0.0);
+    for array_ix in 0..ARRAYS.len() {
+        assert!(flat(&result, array_ix).iter().all(|&v| v == 0.0));
+    }
+}
+
+/// The loss as a function of the raster alone, pixel by pixel.
+#[test]
+fn stretching_sends_gradients_through_the_smallest_and_the_largest_pixel() {
+    for (weights, seed) in [
+        (PAPER_CODE, 0),
+        (PAPER_CODE, 1),
+        (PAPER_ALPHA, 2),
+        (PAPER_ALPHA, 3),
+    ] {
+        let problem = Problem::new(eventful_scene(seed, 0), weights, 0);
+        let base = problem.gradients(&problem.point);
+        let target = Target::new(&problem.scene.view);
+        let decisions = &base.loss.depth_decisions;
+        let ends = decisions.ends.unwrap();
+        for pixel in 0..base.raster.alpha.len() {
+            let claimed = [base.loss.v_alpha[pixel], base.loss.v_depth_sum[pixel]];
+            for (plane, claimed) in claimed.into_iter().enumerate() {
+                // A third of the way to the next decision at most.
+                let step = 1e-6_f64.min(0.3 * decisions.margin);
+                let [low, high] = [-step, step].map(|by| {
+                    let mut raster = base.raster.clone();
+                    [&mut raster.alpha, &mut raster.depth_sum][plane][pixel] += by;
+                    loss::loss(&raster, &target, &weights).total
+                });
+                let numeric = (high - low) / (2.0 * step);
+                assert!(
+                    (claimed - numeric).abs() <= 1e-6 + 1e-5 * numeric.abs(),
+                    "seed {seed}, pixel {pixel}, plane {plane}: {claimed:e}, differences say {numeric:e}"
+                );
+            }
+            let is_moved = claimed != [0.0; 2];
+            assert!(
+                is_moved || !ends.contains(&pixel),
+                "seed {seed}, pixel {pixel}"
+            );
+        }
+    }
 }

@@ -32,6 +32,28 @@ pub(crate) fn exp2<const FMA: bool>(x: f32) -> f32 {
     f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
 
+/// What `multiversion` picks on this machine, for logs.
+pub(crate) fn instruction_set() -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::is_x86_feature_detected as has;
+        if !has!("avx2") || !has!("fma") {
+            return "sse2";
+        }
+        let has_avx512 =
+            has!("avx512f") && has!("avx512vl") && has!("avx512bw") && has!("avx512dq");
+        if has_avx512 { "avx512" } else { "avx2+fma" }
+    }
+    #[cfg(target_arch = "aarch64")]
+    {
+        "neon"
+    }
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    {
+        "scalar"
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::exp2;

@@ -1,28 +1,29 @@
 //! loss: rendered planes and the photo -> one number, and its gradient at every pixel.
 //!
-//! After `raster`. L1 + SSIM on colour, Huber on relative inverse depth. Equations: docs/GRADIENTS.md, losses.
+//! After `raster`. L1 + SSIM on exposed colour, weighted by pixel; depth is in `loss_depth`. Equations: docs/GRADIENTS.md,
+//! losses.
 
 use rayon::prelude::*;
 
 use super::lanes::LANES;
+use super::loss_depth::{Stretched, depth_gradient};
 use super::raster::{PLANE_MARGIN, Raster};
 use super::ssim::{self, REACH, TAPS, Terms, Window};
 use crate::frame::{DepthMap, RgbImage};
 use crate::splat::StepSettings;
 
-/// Relative error of inverse depth at which the depth loss turns from square to linear.
-const HUBER_DELTA: f32 = 0.05;
-/// A pixel that is mostly see-through has no depth to speak of.
-const MIN_ALPHA_FOR_DEPTH: f32 = 0.5;
-const MIN_CONFIDENCE_SUM: f64 = 1e-6;
 /// Rows that one parallel task takes at least.
-const ROWS_PER_TASK: usize = 4;
+pub(crate) const ROWS_PER_TASK: usize = 4;
 
 /// What the rendering should look like. The image has the size of the rendering; the depth map may be smaller.
 #[derive(Debug, Clone, Copy)]
 pub struct Target<'a> {
     pub image: &'a RgbImage,
     pub depth: Option<&'a DepthMap>,
+    /// Weight of each pixel, 255: all.
+    pub mask: Option<&'a [u8]>,
+    /// Log gain and offset of r, g, b that the rendering is compared with.
+    pub exposure: [[f32; 3]; 2],
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -34,28 +35,35 @@ pub struct LossValue {
     pub ssim: f64,
     /// Before its weight.
     pub depth: f64,
+    /// d total / d log gain and offset of r, g, b.
+    pub exposure: [[f64; 3]; 2],
 }
 
 /// d loss / d plane, planes and stride as in `Raster`; margins hold nothing.
 #[derive(Debug, Default)]
 pub struct PixelGradients {
     pub planes: [Vec<f32>; 5],
-    scratch: Scratch,
+    pub(crate) scratch: Scratch,
 }
 
 #[derive(Debug, Default)]
-struct Scratch {
+pub(crate) struct Scratch {
     stride: usize,
+    /// One channel of the photo, and of the rendering as exposed.
     target: Vec<f32>,
+    exposed: Vec<f32>,
+    /// 0 to 1, one per pixel.
+    pub(crate) weights: Vec<f32>,
     /// x, y, x^2, y^2, xy blurred along rows.
     moments: [Vec<f32>; 5],
     /// p, q, r of `ssim::Terms`; two more rows to work in.
     terms: [Vec<f32>; 5],
     /// p, q, r blurred along rows.
     blurred: [Vec<f32>; 3],
-    row_sums: Vec<[f64; 2]>,
+    pub(crate) row_sums: Vec<[f64; 3]>,
     /// Column of the depth map that each pixel of a row takes.
-    map_columns: Vec<usize>,
+    pub(crate) map_columns: Vec<usize>,
+    pub(crate) stretched: Vec<Stretched>,
     zeros: Vec<f32>,
 }
 
@@ -67,23 +75,14 @@ pub fn loss(
     out: &mut PixelGradients,
 ) -> LossValue {
     out.resize(raster);
-    let n = 3.0 * (raster.width_px * raster.height_px) as f64;
-    if n == 0.0 {
+    let n_pixels = raster.width_px * raster.height_px;
+    if n_pixels == 0 {
         return LossValue::default();
     }
     let weight = f64::from(settings.ssim_weight);
-    let weights = [((1.0 - weight) / n) as f32, (-weight / n) as f32];
-    let mut value = LossValue::default();
-    for channel in 0..3 {
-        load_target(target.image, channel, raster, &mut out.scratch);
-        blur_moments(raster, channel, &mut out.scratch);
-        value.ssim += blur_terms(raster, &mut out.scratch) / n;
-        value.l1 += photo_gradient(raster, channel, weights, out) / n;
-    }
+    let mut value = photo_loss(raster, target, weight, out);
     value.depth = match target.depth {
-        Some(depth) if settings.depth_weight > 0.0 => {
-            depth_gradient(raster, depth, settings.depth_weight, out)
-        }
+        Some(depth) if settings.depth_weight > 0.0 => depth_gradient(raster, depth, settings, out),
         _ => {
             out.planes[3].fill(0.0);
             out.planes[4].fill(0.0);
@@ -93,6 +92,64 @@ pub fn loss(
     value.total = (1.0 - weight) * value.l1 + weight * (1.0 - value.ssim);
     value.total += f64::from(settings.depth_weight) * value.depth;
     value
+}
+
+/// Fills r, g, b of the gradient.
+fn photo_loss(
+    raster: &Raster,
+    target: &Target<'_>,
+    ssim_weight: f64,
+    out: &mut PixelGradients,
+) -> LossValue {
+    let mut value = LossValue::default();
+    let n = 3.0 * load_weights(target.mask, &mut out.scratch.weights);
+    if n == 0.0 {
+        // Nothing is wanted, so everything is right.
+        out.planes[..3].iter_mut().for_each(|plane| plane.fill(0.0));
+        value.ssim = 1.0;
+        return value;
+    }
+    let weights = [((1.0 - ssim_weight) / n) as f32, (-ssim_weight / n) as f32];
+    let [gains, offsets] = target.exposure;
+    for channel in 0..3 {
+        let exposure = [gains[channel].exp(), offsets[channel]];
+        load_target(target.image, channel, raster, &mut out.scratch);
+        expose(raster, channel, exposure, &mut out.scratch);
+        blur_moments(raster, &mut out.scratch);
+        value.ssim += blur_terms(raster, target.mask.is_some(), &mut out.scratch) / n;
+        let [l1, by_gain, by_offset] = photo_gradient(raster, channel, exposure, weights, out);
+        value.l1 += l1 / n;
+        value.exposure[0][channel] = by_gain;
+        value.exposure[1][channel] = by_offset;
+    }
+    value
+}
+
+/// Returns the sum of the weights.
+fn load_weights(mask: Option<&[u8]>, weights: &mut [f32]) -> f64 {
+    let Some(mask) = mask else {
+        weights.fill(1.0);
+        return weights.len() as f64;
+    };
+    let mut sum = 0_u64;
+    for (weight, &byte) in weights.iter_mut().zip(mask) {
+        *weight = f32::from(byte) * (1.0 / 255.0);
+        sum += u64::from(byte);
+    }
+    sum as f64 / 255.0
+}
+
+/// The rendering as the view's camera would have shown it.
+fn expose(raster: &Raster, channel: usize, [gain, offset]: [f32; 2], scratch: &mut Scratch) {
+    let rows = scratch.exposed.par_chunks_mut(raster.stride);
+    rows.with_min_len(ROWS_PER_TASK)
+        .enumerate()
+        .for_each(|(y, out)| {
+            let rendered = raster.row(channel, y);
+            for (out, x) in out[PLANE_MARGIN..].iter_mut().zip(rendered) {
+                *out = gain * x + offset;
+            }
+        });
 }
 
 fn load_target(image: &RgbImage, channel: usize, raster: &Raster, scratch: &mut Scratch) {
@@ -110,10 +167,11 @@ fn load_target(image: &RgbImage, channel: usize, raster: &Raster, scratch: &mut 
         });
 }
 
-fn blur_moments(raster: &Raster, channel: usize, scratch: &mut Scratch) {
+fn blur_moments(raster: &Raster, scratch: &mut Scratch) {
     let (stride, width) = (raster.stride, raster.width_px);
     let [x, y, xx, yy, xy] = &mut scratch.moments;
-    let inputs = raster.planes[channel]
+    let inputs = scratch
+        .exposed
         .par_chunks(stride)
         .zip(scratch.target.par_chunks(stride));
     let outputs = (
@@ -137,13 +195,14 @@ fn blur_moments(raster: &Raster, channel: usize, scratch: &mut Scratch) {
         });
 }
 
-/// Finishes the blur of the moments, and starts the one of the derivatives. Returns the sum of SSIM.
-fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
+/// Finishes the blur of the moments, and starts the one of the derivatives. Returns the weighted sum of SSIM.
+fn blur_terms(raster: &Raster, is_weighted: bool, scratch: &mut Scratch) -> f64 {
     let (stride, width) = (raster.stride, raster.width_px);
     let Scratch {
         moments,
         terms: [p, q, r, s, spare],
         blurred: [bp, bq, br],
+        weights,
         row_sums,
         zeros,
         ..
@@ -157,12 +216,13 @@ fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
         bp.par_chunks_mut(width),
         bq.par_chunks_mut(width),
         br.par_chunks_mut(width),
+        weights.par_chunks(width),
         row_sums.par_iter_mut(),
     );
     rows.into_par_iter()
         .with_min_len(ROWS_PER_TASK)
         .enumerate()
-        .for_each(|(y, (p, q, r, s, spare, bp, bq, br, sum))| {
+        .for_each(|(y, (p, q, r, s, spare, bp, bq, br, weights, sum))| {
             let mut rows = [p, q, r, s, spare];
             for (row, moment) in rows.iter_mut().zip(&*moments) {
                 ssim::blur(
@@ -174,7 +234,14 @@ fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
                 let [p, q, r, s, spare] =
                     rows.each_mut().map(|row| &mut row[PLANE_MARGIN..][..width]);
                 ssim::terms_in_place(p, q, r, s, spare);
-                sum[0] = sum_of(s);
+                if is_weighted {
+                    for row in [p, q, r, &mut *s] {
+                        row.iter_mut()
+                            .zip(weights)
+                            .for_each(|(x, weight)| *x *= weight);
+                    }
+                }
+                sum[0] = sum_of([s], |[s]| s);
             }
             for (row, out) in rows.iter().zip([bp, bq, br]) {
                 ssim::blur(&ssim::shifted(&row[PLANE_MARGIN - REACH..], width), out);
@@ -183,16 +250,19 @@ fn blur_terms(raster: &Raster, scratch: &mut Scratch) -> f64 {
     row_sums.iter().map(|sums| sums[0]).sum()
 }
 
-/// Returns the sum of absolute differences.
+/// Returns the weighted sum of absolute differences, and the gradients of the channel's log gain and offset.
 fn photo_gradient(
     raster: &Raster,
     channel: usize,
+    [gain, _]: [f32; 2],
     weights: [f32; 2],
     out: &mut PixelGradients,
-) -> f64 {
+) -> [f64; 3] {
     let (stride, width) = (raster.stride, raster.width_px);
     let Scratch {
         target,
+        exposed,
+        weights: pixel_weights,
         blurred: [p, q, r],
         row_sums,
         zeros,
@@ -203,24 +273,30 @@ fn photo_gradient(
         .zip(row_sums.par_iter_mut());
     rows.with_min_len(ROWS_PER_TASK)
         .enumerate()
-        .for_each(|(y, (out, sum))| {
-            let rendered = raster.row(channel, y);
-            let photo = &target[y * stride + PLANE_MARGIN..][..width];
+        .for_each(|(y, (out, sums))| {
+            let out = &mut out[PLANE_MARGIN..][..width];
+            let [exposed, photo] =
+                [&*exposed, &*target].map(|plane| &plane[y * stride + PLANE_MARGIN..][..width]);
+            let pixel_weights = &pixel_weights[y * width..][..width];
             let terms = Terms {
                 p: window(p, y, width, zeros),
                 q: window(q, y, width, zeros),
                 r: window(r, y, width, zeros),
             };
-            ssim::gradient_row(
-                &terms,
-                rendered,
-                photo,
-                weights,
-                &mut out[PLANE_MARGIN..][..width],
-            );
-            sum[0] = sum_of_differences(rendered, photo);
+            ssim::gradient_row(&terms, exposed, photo, pixel_weights, weights, out);
+            let compared = [pixel_weights, exposed, photo];
+            sums[0] = sum_of(compared, |[weight, x, y]| weight * (x - y).abs());
+            sums[2] = sum_of([out], |[v]| v);
+            if gain != 1.0 {
+                out.iter_mut().for_each(|v| *v *= gain);
+            }
+            sums[1] = sum_of([raster.row(channel, y), out], |[x, v]| x * v);
         });
-    row_sums.iter().map(|sums| sums[0]).sum()
+    let mut total = [0.0; 3];
+    for sums in &*row_sums {
+        (0..3).for_each(|k| total[k] += sums[k]);
+    }
+    total
 }
 
 /// Rows y - REACH to y + REACH of a plane without margins; zeros beyond its edges.
@@ -237,120 +313,19 @@ fn window<'a>(plane: &'a [f32], y: usize, width: usize, zeros: &'a [f32]) -> Win
     window
 }
 
-/// Returns the depth loss before its weight.
-fn depth_gradient(raster: &Raster, map: &DepthMap, weight: f32, out: &mut PixelGradients) -> f64 {
-    let Scratch {
-        row_sums,
-        map_columns,
-        ..
-    } = &mut out.scratch;
-    let map_width = map.width_px as usize;
-    map_columns.clear();
-    // floor((x + 0.5) * map_width / width) in integers.
-    map_columns
-        .extend((0..raster.width_px).map(|x| (2 * x + 1) * map_width / (2 * raster.width_px)));
-    let map_columns = &*map_columns;
-    row_sums
-        .par_iter_mut()
-        .with_min_len(ROWS_PER_TASK)
-        .enumerate()
-        .for_each(|(y, sums)| {
-            let confidences = depth_targets(raster, map, map_columns, y).flatten();
-            *sums = [
-                confidences
-                    .map(|(_, confidence)| f64::from(confidence))
-                    .sum(),
-                0.0,
-            ];
-        });
-    let confidence_sum = row_sums
-        .iter()
-        .map(|sums| sums[0])
-        .sum::<f64>()
-        .max(MIN_CONFIDENCE_SUM);
-    let scale = (f64::from(weight) / confidence_sum) as f32;
-    let [.., alpha_plane, depth_plane] = &mut out.planes;
-    let rows = (
-        alpha_plane.par_chunks_mut(raster.stride),
-        depth_plane.par_chunks_mut(raster.stride),
-        row_sums.par_iter_mut(),
-    );
-    let rows = rows.into_par_iter().with_min_len(ROWS_PER_TASK).enumerate();
-    rows.for_each(|(y, (v_alpha, v_depth_sum, sums))| {
-        v_alpha.fill(0.0);
-        v_depth_sum.fill(0.0);
-        let (alpha, depth_sum) = (raster.row(3, y), raster.row(4, y));
-        for (x, target) in depth_targets(raster, map, map_columns, y).enumerate() {
-            let Some((target, confidence)) = target else {
-                continue;
-            };
-            if alpha[x] <= MIN_ALPHA_FOR_DEPTH {
-                continue;
-            }
-            let depth = depth_sum[x] / alpha[x];
-            let (huber, slope) = huber(target / depth - 1.0);
-            sums[1] += f64::from(confidence) * f64::from(huber);
-            let v_depth = -scale * confidence * slope * target / (depth * depth);
-            v_depth_sum[PLANE_MARGIN + x] = v_depth / alpha[x];
-            v_alpha[PLANE_MARGIN + x] = -v_depth * depth / alpha[x];
-        }
-    });
-    row_sums.iter().map(|sums| sums[1]).sum::<f64>() / confidence_sum
-}
-
-/// Depth and confidence wanted at the pixels of a row, nearest neighbour.
-fn depth_targets<'a>(
-    raster: &Raster,
-    map: &'a DepthMap,
-    map_columns: &'a [usize],
-    y: usize,
-) -> impl Iterator<Item = Option<(f32, f32)>> + 'a {
-    let (map_width, map_height) = (map.width_px as usize, map.height_px as usize);
-    let map_y = (2 * y + 1) * map_height / (2 * raster.height_px);
-    let row = map_y * map_width..(map_y + 1) * map_width;
-    // Empty when the map is shorter than it says.
-    let depths = map.depth.get(row.clone()).unwrap_or_default();
-    let confidences = map.confidence.get(row).unwrap_or_default();
-    map_columns.iter().map(|&x| {
-        let (depth, confidence) = (*depths.get(x)?, *confidences.get(x)?);
-        let is_usable =
-            depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
-        is_usable.then_some((depth, confidence))
-    })
-}
-
-/// Value and slope.
-fn huber(error: f32) -> (f32, f32) {
-    if error.abs() <= HUBER_DELTA {
-        (0.5 * error * error / HUBER_DELTA, error / HUBER_DELTA)
-    } else {
-        (error.abs() - 0.5 * HUBER_DELTA, error.signum())
-    }
-}
-
-fn sum_of(row: &[f32]) -> f64 {
-    let (vectors, rest) = row.as_chunks::<LANES>();
+/// Sum of `value` of the numbers of each column, in f32 by lanes and then in f64: rows are short.
+#[inline(always)]
+fn sum_of<const N: usize>(rows: [&[f32]; N], value: impl Fn([f32; N]) -> f32) -> f64 {
+    let parts = rows.map(|row| row.as_chunks::<LANES>());
     let mut sums = [0.0; LANES];
-    for vector in vectors {
-        for i in 0..LANES {
-            sums[i] += vector[i];
+    for c in 0..parts[0].0.len() {
+        let vectors = parts.map(|(vectors, _)| &vectors[c]);
+        for (i, sum) in sums.iter_mut().enumerate() {
+            *sum += value(vectors.map(|vector| vector[i]));
         }
     }
-    sums.iter().chain(rest).map(|&x| f64::from(x)).sum()
-}
-
-fn sum_of_differences(a: &[f32], b: &[f32]) -> f64 {
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    let mut sums = [0.0; LANES];
-    for (a, b) in a.iter().zip(b) {
-        for i in 0..LANES {
-            sums[i] += (a[i] - b[i]).abs();
-        }
-    }
-    let rest = a_rest
-        .iter()
-        .zip(b_rest)
-        .map(|(a, b)| f64::from((a - b).abs()));
+    let rests = parts.map(|(_, rest)| rest);
+    let rest = (0..rests[0].len()).map(|i| f64::from(value(rests.map(|rest| rest[i]))));
     sums.iter().map(|&x| f64::from(x)).sum::<f64>() + rest.sum::<f64>()
 }
 
@@ -362,10 +337,13 @@ impl PixelGradients {
         // Margins must stay zero, and another width moves them.
         if scratch.stride != raster.stride {
             scratch.target.clear();
+            scratch.exposed.clear();
             scratch.terms.iter_mut().for_each(Vec::clear);
         }
         scratch.stride = raster.stride;
         scratch.target.resize(n_padded, 0.0);
+        scratch.exposed.resize(n_padded, 0.0);
+        scratch.weights.resize(n_pixels, 0.0);
         scratch
             .terms
             .iter_mut()
@@ -375,7 +353,7 @@ impl PixelGradients {
             .iter_mut()
             .chain(&mut scratch.blurred)
             .for_each(|m| m.resize(n_pixels, 0.0));
-        scratch.row_sums.resize(raster.height_px, [0.0; 2]);
+        scratch.row_sums.resize(raster.height_px, [0.0; 3]);
         scratch.zeros.resize(raster.width_px, 0.0);
         self.planes.iter_mut().for_each(|p| p.resize(n_padded, 0.0));
     }

@@ -4,33 +4,45 @@
 //! Results do not depend on the number of threads: tasks are of fixed size and sums run in a fixed order.
 
 pub mod adam;
+mod adam_sh;
 pub mod bin;
+mod exposure;
 mod lanes;
 pub mod loss;
+mod loss_depth;
+mod moves;
+mod pass;
 pub mod pose_adam;
 pub mod project;
 pub mod project_backward;
 pub mod raster;
 pub mod raster_backward;
-mod sh;
+mod rows;
+pub(crate) mod sh;
 mod ssim;
 mod tile_splat;
+mod view;
 
-use adam::{Optimiser, retain_rows};
-use bin::Tiles;
-use loss::{LossValue, PixelGradients, Target};
-use pose_adam::PoseAdam;
-use project::{Camera, Projected};
-use project_backward::{Forward, SplatGradients};
-use raster::Raster;
-use raster_backward::InstanceGradients;
+use adam::Optimiser;
+use exposure::Exposure;
+use pass::Pass;
+use pose_adam::FewAdam;
+use project::Camera;
+use view::View;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
 use crate::frame::DepthMap;
 use crate::pose::Rigid;
-use crate::splat::{Engine, Rendering, Splats, StepSettings, StepStats, TrainingView};
+use crate::splat::epipolar::{self, Eye};
+use crate::splat::gradients::Gradients;
+use crate::splat::refiner::Refiner;
+use crate::splat::{
+    Engine, Match, McmcSettings, PoseStep, RefinerSettings, Rendering, Splats, StepSettings,
+    StepStats, TrainingView,
+};
 
 /// Renders and optimises with rayon's global threads.
 #[derive(Debug, Default)]
@@ -38,54 +50,31 @@ pub struct CpuEngine {
     splats: Splats,
     optimiser: Optimiser,
     views: Vec<View>,
+    refiner: Option<Refiner>,
+    log_focal: f64,
+    focal_adam: FewAdam<1>,
     pass: Pass,
     stats: StepStats,
+    /// Steps that were to move splats, this one included.
+    n_trained: u32,
     n_skipped_updates: u64,
     n_left_out: u64,
 }
 
-/// Gradient of one view's loss, for tests and diagnosis. Arrays as in `Splats`, 0 where a splat is not visible.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Gradients {
-    pub means: Vec<[f32; 3]>,
-    pub log_scales: Vec<[f32; 3]>,
-    pub quats: Vec<[f32; 4]>,
-    pub opacity_logits: Vec<f32>,
-    pub sh: Vec<f32>,
-    /// rho, theta of `exp([rho; theta]) * cam_from_map`.
-    pub pose: [f64; 6],
-    /// Photometric, depth and regularisers, weighted.
-    pub loss: f64,
-    pub l1: f64,
-    pub ssim: f64,
-    /// Before its weight.
-    pub depth: f64,
-    pub rendering: Rendering,
-    /// Indices of the visible splats, ascending.
-    pub visible: Vec<u32>,
-}
-
-#[derive(Debug)]
-struct View {
-    view: TrainingView,
-    adam: PoseAdam,
-}
-
-/// Buffers of one way there and back.
-#[derive(Debug, Default)]
-struct Pass {
-    projected: Projected,
-    tiles: Tiles,
-    raster: Raster,
-    pixels: PixelGradients,
-    instances: InstanceGradients,
-    gradients: SplatGradients,
-}
-
 /// One view's loss and gradient, without an update.
 pub fn gradients(splats: &Splats, view: &TrainingView, settings: &StepSettings) -> Gradients {
+    gradients_exposed(splats, view, Exposure::default(), settings)
+}
+
+/// The same at log gains and offsets of r, g, b that are not 0.
+pub fn gradients_exposed(
+    splats: &Splats,
+    view: &TrainingView,
+    exposure: [[f32; 3]; 2],
+    settings: &StepSettings,
+) -> Gradients {
     let mut pass = Pass::default();
-    let value = pass.differentiate(splats, view, settings);
+    let value = pass.differentiate(splats, view, exposure, settings);
     let g = &pass.gradients;
     let mut out = Gradients {
         means: vec![[0.0; 3]; splats.len()],
@@ -98,6 +87,8 @@ pub fn gradients(splats: &Splats, view: &TrainingView, settings: &StepSettings) 
         l1: value.l1,
         ssim: value.ssim,
         depth: value.depth,
+        exposure: value.exposure,
+        log_focal: g.log_focal,
         rendering: pass.raster.rendering(),
         visible: pass.projected.splats.iter().map(|s| s.splat_ix).collect(),
     };
@@ -120,6 +111,57 @@ impl CpuEngine {
     /// Updates left out because a gradient was not finite.
     pub fn n_skipped_updates(&self) -> u64 {
         self.n_skipped_updates
+    }
+
+    /// Moves what the step lets move of the camera that was `seen`. Returns the updates left out.
+    fn step_camera(
+        &mut self,
+        view_ix: usize,
+        seen: &TrainingView,
+        settings: &StepSettings,
+    ) -> usize {
+        let mut gradient = self.pass.gradients.pose;
+        if settings.epipolar_weight > 0.0 {
+            let of_matches = self.epipolar_gradient(view_ix, seen);
+            let weight = f64::from(settings.epipolar_weight);
+            gradient
+                .iter_mut()
+                .zip(of_matches)
+                .for_each(|(g, v)| *g += weight * v);
+        }
+        let view = &mut self.views[view_ix];
+        let is_updated = match (settings.pose, &mut self.refiner) {
+            (PoseStep::Direct, refiner) => view.step_alone(refiner.as_ref(), gradient, settings),
+            (PoseStep::Shared, Some(refiner)) => {
+                view.step_shared(refiner, gradient, settings.lr_refiner)
+            }
+            (PoseStep::Shared, None) | (PoseStep::Held, _) => true,
+        };
+        let mut n_skipped = usize::from(!is_updated);
+        if settings.lr_focal > 0.0 {
+            match self.focal_adam.direction([self.pass.gradients.log_focal]) {
+                Some([change]) => self.log_focal += f64::from(settings.lr_focal) * change,
+                None => n_skipped += 1,
+            }
+        }
+        n_skipped
+    }
+
+    fn epipolar_gradient(&self, view_ix: usize, seen: &TrainingView) -> [f64; 6] {
+        let eye = |view: &TrainingView| Eye {
+            intrinsics: view.intrinsics,
+            cam_from_map: view.cam_from_map,
+        };
+        let matches = &self.views[view_ix].matches;
+        let mut others = BTreeMap::new();
+        for ix in matches.iter().map(|found| found.other_view_ix) {
+            others.entry(ix).or_insert_with(|| {
+                let view = self.views.get(ix as usize)?;
+                Some(eye(&view.seen(self.refiner.as_ref(), self.log_focal.exp())))
+            });
+        }
+        let other = |ix: u32| others.get(&ix).copied().flatten();
+        epipolar::epipolar(&eye(seen), matches, other).1
     }
 
     /// Warns of what went wrong in a step, once of each kind.
@@ -145,40 +187,19 @@ impl Engine for CpuEngine {
         format!(
             "cpu ({} threads, {})",
             rayon::current_num_threads(),
-            instruction_set()
+            lanes::instruction_set()
         )
     }
 
     fn append(&mut self, splats: &Splats) {
-        splats.assert_consistent();
-        if self.splats.is_empty() {
-            self.splats.sh_degree = splats.sh_degree;
-        }
-        assert_eq!(
-            self.splats.sh_degree, splats.sh_degree,
-            "all splats of an engine have one SH degree"
-        );
-        let all = &mut self.splats;
-        all.means.extend_from_slice(&splats.means);
-        all.log_scales.extend_from_slice(&splats.log_scales);
-        all.quats.extend_from_slice(&splats.quats);
-        all.opacity_logits.extend_from_slice(&splats.opacity_logits);
-        all.sh.extend_from_slice(&splats.sh);
-        all.anchors.extend_from_slice(&splats.anchors);
-        self.optimiser.resize(&self.splats);
+        self.splats.extend(splats);
+        self.optimiser.resize(&self.splats, self.n_trained);
     }
 
     fn retain(&mut self, keep: &[bool]) {
         assert_eq!(keep.len(), self.splats.len(), "one flag per splat");
-        let sh_stride = self.splats.sh_stride();
-        let all = &mut self.splats;
-        retain_rows(&mut all.means, 1, keep);
-        retain_rows(&mut all.log_scales, 1, keep);
-        retain_rows(&mut all.quats, 1, keep);
-        retain_rows(&mut all.opacity_logits, 1, keep);
-        retain_rows(&mut all.sh, sh_stride, keep);
-        retain_rows(&mut all.anchors, 1, keep);
-        self.optimiser.retain(sh_stride, keep);
+        self.splats.retain(keep);
+        self.optimiser.retain(self.splats.sh_stride(), keep);
     }
 
     fn overwrite(&mut self, splats: &Splats) {
@@ -208,26 +229,72 @@ impl Engine for CpuEngine {
             3 * size.0 as usize * size.1 as usize,
             "an image is as large as it says"
         );
-        self.views.push(View {
-            view,
-            adam: PoseAdam::default(),
-        });
+        self.views.push(View::new(view, self.refiner.as_ref()));
         self.views.len() - 1
     }
 
     fn set_pose(&mut self, view_ix: usize, cam_from_map: Rigid) {
-        let view = &mut self.views[view_ix];
-        view.view.cam_from_map = cam_from_map;
-        view.adam = PoseAdam::default();
+        self.views[view_ix].set_pose(cam_from_map, self.refiner.as_ref());
+    }
+
+    fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {
+        let view = self.views[view_ix].training_mut();
+        let size = (view.image.width_px, view.image.height_px);
+        assert_eq!(
+            size,
+            (intrinsics.width_px, intrinsics.height_px),
+            "a view's intrinsics are those of its image"
+        );
+        view.intrinsics = *intrinsics;
     }
 
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
-        self.views[view_ix].view.depth = depth;
+        self.views[view_ix].training_mut().depth = depth;
+    }
+
+    fn start_refiner(&mut self, settings: &RefinerSettings) {
+        let old = self.refiner.take();
+        for view in &mut self.views {
+            view.fold(old.as_ref());
+        }
+        self.refiner = Some(Refiner::new(settings));
+    }
+
+    fn set_mask(&mut self, view_ix: usize, mask: Option<Arc<[u8]>>) {
+        self.views[view_ix].set_mask(mask);
+    }
+
+    fn set_matches(&mut self, view_ix: usize, matches: &[Match]) {
+        self.views[view_ix].matches = matches.to_vec();
+    }
+
+    fn relocate_and_grow(&mut self, settings: &McmcSettings) -> usize {
+        let (splats, optimiser) = (&mut self.splats, &mut self.optimiser);
+        moves::relocate_and_grow(splats, optimiser, settings, self.n_trained);
+        self.splats.len()
+    }
+
+    fn focal_factor(&mut self) -> f64 {
+        self.log_focal.exp()
+    }
+
+    fn exposures(&mut self) -> Vec<[[f32; 3]; 2]> {
+        self.views.iter().map(|view| view.exposure).collect()
+    }
+
+    fn peak_gpu_bytes(&self) -> u64 {
+        0
     }
 
     fn step(&mut self, view_ix: usize, settings: &StepSettings) {
-        let view = &mut self.views[view_ix];
-        let value = self.pass.differentiate(&self.splats, &view.view, settings);
+        self.n_trained = self
+            .n_trained
+            .wrapping_add(u32::from(settings.train_splats));
+        let view = self.views[view_ix].seen(self.refiner.as_ref(), self.log_focal.exp());
+        let exposure = self.views[view_ix].exposure;
+        let value = self
+            .pass
+            .differentiate(&self.splats, &view, exposure, settings);
         self.stats.n_steps += 1;
         self.stats.loss += value.total + self.pass.gradients.regulariser;
         self.stats.l1 += value.l1;
@@ -235,24 +302,19 @@ impl Engine for CpuEngine {
         if self.pass.projected.splats.is_empty() {
             return;
         }
-        let mut n_skipped = 0;
-        if settings.train_pose {
-            let rates = [settings.lr_pose_translation, settings.lr_pose_rotation];
-            match view
-                .adam
-                .update(&view.view.cam_from_map, self.pass.gradients.pose, rates)
-            {
-                Some(pose) => view.view.cam_from_map = pose,
-                None => n_skipped += 1,
-            }
+        let mut n_skipped = self.step_camera(view_ix, &view, settings);
+        if settings.lr_exposure > 0.0 {
+            let view = &mut self.views[view_ix];
+            let is_updated = view.step_exposure(value.exposure, settings.lr_exposure);
+            n_skipped += usize::from(!is_updated);
         }
         if settings.train_splats {
-            n_skipped += self.optimiser.update(
-                &mut self.splats,
-                &self.pass.projected,
-                &self.pass.gradients,
-                settings,
-            );
+            let (splats, seen) = (&mut self.splats, &self.pass.projected);
+            let g = &self.pass.gradients;
+            n_skipped += self
+                .optimiser
+                .update(splats, seen, g, settings, self.n_trained);
+            moves::shake(splats, seen, settings, self.n_trained);
         }
         self.count_troubles(n_skipped);
     }
@@ -271,7 +333,7 @@ impl Engine for CpuEngine {
     fn poses(&mut self) -> Vec<Rigid> {
         self.views
             .iter()
-            .map(|view| view.view.cam_from_map)
+            .map(|view| view.pose(self.refiner.as_ref()))
             .collect()
     }
 
@@ -291,94 +353,5 @@ impl Engine for CpuEngine {
             sh_degree,
         );
         self.pass.raster.rendering()
-    }
-}
-
-impl Pass {
-    fn render(&mut self, splats: &Splats, camera: &Camera, sh_degree: u8) {
-        project::project(splats, camera, sh_degree, &mut self.projected);
-        bin::bin(
-            &self.projected.splats,
-            camera.width_px,
-            camera.height_px,
-            &mut self.tiles,
-        );
-        raster::raster(&self.projected.splats, &self.tiles, &mut self.raster);
-    }
-
-    fn differentiate(
-        &mut self,
-        splats: &Splats,
-        view: &TrainingView,
-        settings: &StepSettings,
-    ) -> LossValue {
-        let camera = Camera::new(&view.intrinsics, &view.cam_from_map);
-        self.render(splats, &camera, settings.sh_degree);
-        let visible = &self.projected.splats;
-        let target = Target {
-            image: &view.image,
-            depth: view.depth.as_deref(),
-        };
-        let value = loss::loss(&self.raster, &target, settings, &mut self.pixels);
-        raster_backward::raster_backward(
-            visible,
-            &self.tiles,
-            &self.raster,
-            &self.pixels,
-            &mut self.instances,
-        );
-        let forward = Forward {
-            splats,
-            camera: &camera,
-            visible,
-            tiles: &self.tiles,
-        };
-        project_backward::project_backward(forward, &self.instances, settings, &mut self.gradients);
-        value
-    }
-}
-
-impl Splats {
-    /// Our own mistake when it fails: readers of files check before.
-    fn assert_consistent(&self) {
-        let n = self.means.len();
-        let lengths = [
-            self.log_scales.len(),
-            self.quats.len(),
-            self.opacity_logits.len(),
-            self.anchors.len(),
-        ];
-        assert_eq!(lengths, [n; 4], "all attributes of splats have one length");
-        assert!(
-            self.sh_degree <= 3,
-            "SH degree {} is above 3",
-            self.sh_degree
-        );
-        assert_eq!(
-            self.sh.len(),
-            n * self.sh_stride(),
-            "SH has `sh_stride` numbers a splat"
-        );
-    }
-}
-
-fn instruction_set() -> &'static str {
-    #[cfg(target_arch = "x86_64")]
-    {
-        use std::arch::is_x86_feature_detected as has;
-        if !has!("avx2") || !has!("fma") {
-            return "sse2";
-        }
-        let has_avx512 =
-            has!("avx512f") && has!("avx512vl") && has!("avx512bw") && has!("avx512dq");
-        if has_avx512 { "avx512" } else { "avx2+fma" }
-    }
-    #[cfg(target_arch = "aarch64")]
-    {
-        "neon"
-    }
-    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-    {
-        "scalar"
     }
 }

@@ -69,7 +69,7 @@ pub struct Projected {
     /// In order of `splat_ix`.
     pub splats: Vec<ProjectedSplat>,
     /// `splats[chunk_ends[c - 1]..chunk_ends[c]]` stem from the c-th `CHUNK` of all splats.
-    pub(crate) chunk_ends: Vec<u32>,
+    chunk_ends: Vec<u32>,
     chunks: Vec<Vec<ProjectedSplat>>,
 }
 
@@ -92,6 +92,14 @@ pub(crate) struct Shape {
     /// Upper triangle of the 2D covariance, eps included, and its determinant.
     pub(crate) cov: [f64; 3],
     pub(crate) det: f64,
+}
+
+impl Projected {
+    /// Indices of the visible splats that stem from the c-th `CHUNK`.
+    pub(crate) fn of_chunk(&self, c: usize) -> std::ops::Range<usize> {
+        let begin = c.checked_sub(1).map_or(0, |before| self.chunk_ends[before]);
+        begin as usize..self.chunk_ends[c] as usize
+    }
 }
 
 /// Finds the splats that `camera` can see. SH bands above `sh_degree` are left out.

@@ -26,6 +26,8 @@ pub struct SplatGradients {
     pub is_finite: Vec<bool>,
     /// d loss / d (rho, theta) of `exp([rho; theta]) * cam_from_map` at 0.
     pub pose: [f64; 6],
+    /// d loss / d s at 0, where `exp(s)` multiplies both focal lengths.
+    pub log_focal: f64,
     /// Part of the loss that the regularisers are.
     pub regulariser: f64,
     partials: Vec<Partial>,
@@ -36,6 +38,7 @@ pub struct SplatGradients {
 struct Partial {
     rho: DVec3,
     theta: DVec3,
+    log_focal: f64,
     opacity: f64,
     scale: f64,
 }
@@ -57,6 +60,7 @@ struct Gradient {
     opacity_logit: f64,
     rho: DVec3,
     theta: DVec3,
+    log_focal: f64,
 }
 
 /// Sums the instances of each visible splat and takes them through the projection.
@@ -99,6 +103,7 @@ pub fn project_backward(
                 if is_finite[k] {
                     partial.rho += gradient.rho;
                     partial.theta += gradient.theta;
+                    partial.log_focal += gradient.log_focal;
                 }
             }
         },
@@ -176,6 +181,7 @@ impl Forward<'_> {
             rho: g_in_cam + self.camera.rotation * g_direction,
             theta: shape.mean_in_cam.cross(g_in_cam)
                 + 2.0 * DVec3::new(twist.col(2).y, twist.col(0).z, twist.col(1).x),
+            log_focal: log_focal_gradient(&shape, self.camera, g_center, [g_j0, g_j1]),
         }
     }
 
@@ -257,6 +263,23 @@ fn position_gradient(
     g_xy.extend(g_z.element_sum())
 }
 
+/// Both focal lengths times `exp(s)`: through the pixel and through the Jacobian. A held slope is as the inverse of
+/// the focal length, so its entry of the Jacobian stays.
+fn log_focal_gradient(
+    shape: &Shape,
+    camera: &Camera,
+    g_center: DVec2,
+    [g_j0, g_j1]: [DVec3; 2],
+) -> f64 {
+    let p = shape.mean_in_cam;
+    let of_axis = |axis: usize, focal: f64, g_diagonal: f64, g_slope: f64| {
+        let free = if shape.is_clamped[axis] { 0.0 } else { 1.0 };
+        let by_slope = free * shape.slope[axis] * g_slope;
+        focal / p.z * (p[axis] * g_center[axis] + g_diagonal - by_slope)
+    };
+    of_axis(0, camera.fx, g_j0.x, g_j0.z) + of_axis(1, camera.fy, g_j1.y, g_j1.z)
+}
+
 /// Rotation matrix to the stored quaternion, through its normalisation.
 fn quat_gradient(shape: &Shape, g_rotation: &DMat3) -> [f64; 4] {
     let [w, x, y, z] = shape.quat;
@@ -290,6 +313,7 @@ impl Gradient {
         opacity_logit: 0.0,
         rho: DVec3::ZERO,
         theta: DVec3::ZERO,
+        log_focal: 0.0,
     };
 }
 
@@ -328,6 +352,7 @@ impl SplatGradients {
         for partial in &self.partials {
             sum.rho += partial.rho;
             sum.theta += partial.theta;
+            sum.log_focal += partial.log_focal;
             sum.opacity += partial.opacity;
             sum.scale += partial.scale;
         }
@@ -339,6 +364,7 @@ impl SplatGradients {
             sum.theta.y,
             sum.theta.z,
         ];
+        self.log_focal = sum.log_focal;
         let n = self.means.len().max(1) as f64;
         self.regulariser = f64::from(settings.opacity_reg) * sum.opacity / n
             + f64::from(settings.scale_reg) * sum.scale / (3.0 * n);

@@ -132,7 +132,7 @@ pub(crate) fn terms_in_place(
     }
 }
 
-/// `weights[0] * sign(x - y) + weights[1] * dSSIM/dx` of a row.
+/// `weights[0] * pixel_weight * sign(x - y) + weights[1] * dSSIM/dx` of a row; the terms are weighted already.
 #[multiversion(targets(
     "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma",
     "x86_64+avx2+fma",
@@ -142,13 +142,14 @@ pub(crate) fn gradient_row(
     terms: &Terms<'_>,
     x: &[f32],
     y: &[f32],
+    pixel_weights: &[f32],
     weights: [f32; 2],
     out: &mut [f32],
 ) {
     multiversion::target::match_target! {
-        "x86_64+avx2+fma" => gradient_row_with::<true>(terms, x, y, weights, out),
-        "aarch64+neon" => gradient_row_with::<true>(terms, x, y, weights, out),
-        _ => gradient_row_with::<false>(terms, x, y, weights, out),
+        "x86_64+avx2+fma" => gradient_row_with::<true>(terms, x, y, pixel_weights, weights, out),
+        "aarch64+neon" => gradient_row_with::<true>(terms, x, y, pixel_weights, weights, out),
+        _ => gradient_row_with::<false>(terms, x, y, pixel_weights, weights, out),
     }
 }
 
@@ -157,11 +158,12 @@ fn gradient_row_with<const FMA: bool>(
     terms: &Terms<'_>,
     x: &[f32],
     y: &[f32],
+    pixel_weights: &[f32],
     weights: [f32; 2],
     out: &mut [f32],
 ) {
     let n = out.len();
-    let (x, y) = (&x[..n], &y[..n]);
+    let (x, y, pixel_weights) = (&x[..n], &y[..n], &pixel_weights[..n]);
     let p: Window<'_> = std::array::from_fn(|t| &terms.p[t][..n]);
     let q: Window<'_> = std::array::from_fn(|t| &terms.q[t][..n]);
     let r: Window<'_> = std::array::from_fn(|t| &terms.r[t][..n]);
@@ -174,6 +176,7 @@ fn gradient_row_with<const FMA: bool>(
         }
         let difference = x[i] - y[i];
         let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
+        let sign = pixel_weights[i] * sign;
         out[i] = weights[0] * sign + weights[1] * (sum_p + 2.0 * x[i] * sum_q + y[i] * sum_r);
     }
 }

@@ -3,14 +3,17 @@
 
 pub mod adam;
 pub mod bin;
+pub mod differences;
 pub mod doubt;
 pub mod hostile;
 pub mod loss;
+pub mod loss_depth;
 pub mod project;
 pub mod project_backward;
 pub mod random;
 pub mod raster;
 pub mod raster_backward;
+pub mod refiner;
 
 use std::sync::Arc;
 
@@ -18,7 +21,7 @@ use nalgebra::{Matrix3, Vector3};
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::frame::DepthMap;
 use splat_mapper::pose::Rigid;
-use splat_mapper::splat::{Splats, StepSettings, TrainingView};
+use splat_mapper::splat::{DepthMode, Splats, StepSettings, TrainingView};
 
 use loss::Loss;
 use raster::Raster;
@@ -50,6 +53,10 @@ pub struct Target {
     pub rgb: Vec<f64>,
     /// (depth, confidence) per picture pixel; (0, 0) where there is none.
     pub depth: Vec<(f64, f64)>,
+    /// How much each pixel counts, 0 to 1.
+    pub weights: Vec<f64>,
+    /// Log gain and offset of r, g, b, under which the rendering is compared.
+    pub exposure: [[f64; 3]; 2],
 }
 
 /// Weight of each term, so that tests can look at one alone.
@@ -58,6 +65,7 @@ pub struct Weights {
     pub l1: f64,
     pub ssim: f64,
     pub depth: f64,
+    pub depth_mode: DepthMode,
     pub opacity: f64,
     pub scale: f64,
 }
@@ -67,6 +75,10 @@ pub struct Gradients {
     pub splats: Params,
     /// With respect to the left-multiplied increment `exp([rho; theta])`: rho, then theta.
     pub pose: [f64; 6],
+    /// Log gain and offset of r, g, b.
+    pub exposure: [[f64; 3]; 2],
+    /// With respect to s, where exp(s) multiplies both focal lengths.
+    pub log_focal: f64,
     pub loss: Loss,
     pub raster: Raster,
     /// Splats that are drawn; only these get regularised and updated.
@@ -129,17 +141,27 @@ impl Target {
             .iter()
             .map(|&value| f64::from(value) / 255.0)
             .collect();
+        let weights: Vec<f64> = match &view.mask {
+            Some(mask) => mask.iter().map(|&byte| f64::from(byte) / 255.0).collect(),
+            None => vec![1.0; width_px * height_px],
+        };
         let depth = (0..width_px * height_px)
             .map(|pixel| {
-                sample_depth(
+                let (depth, confidence) = sample_depth(
                     view.depth.as_ref(),
                     pixel % width_px,
                     pixel / width_px,
                     [width_px, height_px],
-                )
+                );
+                (depth, weights[pixel] * confidence)
             })
             .collect();
-        Self { rgb, depth }
+        Self {
+            rgb,
+            depth,
+            weights,
+            exposure: [[0.0; 3]; 2],
+        }
     }
 }
 
@@ -168,6 +190,7 @@ impl Weights {
             l1: 1.0 - ssim,
             ssim,
             depth: f64::from(settings.depth_weight),
+            depth_mode: settings.depth_mode,
             opacity: f64::from(settings.opacity_reg),
             scale: f64::from(settings.scale_reg),
         }
@@ -203,12 +226,14 @@ pub fn gradients(
     let mut loss = loss::loss(&raster, target, weights);
 
     let on_projected = raster_backward::raster_backward(&projected, &raster, &loss);
-    let (mut splats, pose) =
+    let (mut splats, pose, log_focal) =
         project_backward::project_backward(params, camera, &projected, &on_projected, sh_degree);
     loss.total += loss::regularise(params, &visible, weights, &mut splats);
     Gradients {
         splats,
         pose,
+        exposure: loss.v_exposure,
+        log_focal,
         loss,
         raster,
         visible,

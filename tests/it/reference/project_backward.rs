@@ -1,24 +1,25 @@
 //! Gradients of the 2D Gaussians -> gradients of the splats and of the pose. docs/GRADIENTS.md 7 and 8.
 
-use nalgebra::{Matrix3, Vector3, Vector4};
+use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
 use super::project::{Projected, SH, rotation, sh_basis};
 use super::raster_backward::ProjectedGradient;
 use super::{Camera, Params};
 
-/// Gradient of the splats and of [rho; theta].
+/// Gradient of the splats, of [rho; theta] and of the logarithm of a factor on both focal lengths.
 pub fn project_backward(
     params: &Params,
     camera: &Camera,
     projected: &[Projected],
     gradients: &[ProjectedGradient],
     sh_degree: u8,
-) -> (Params, [f64; 6]) {
+) -> (Params, [f64; 6], f64) {
     let mut splats = Params::zeros_like(params);
-    let (mut rho, mut theta) = (Vector3::zeros(), Vector3::zeros());
+    let (mut rho, mut theta, mut log_focal) = (Vector3::zeros(), Vector3::zeros(), 0.0);
     for (splat, v) in projected.iter().zip(gradients) {
         let ix = splat.splat_ix;
         let (v_mean_in_cam, v_covariance_in_cam) = through_projection(camera, splat, v);
+        log_focal += through_focal(camera, splat, v);
         let v_offset_in_map = through_colour(params, splat, v, sh_degree, &mut splats.sh);
 
         let v_mean = camera.rotation.transpose() * v_mean_in_cam + v_offset_in_map;
@@ -34,7 +35,8 @@ pub fn project_backward(
             - v_covariance_in_cam * splat.covariance_in_cam;
         theta += splat.mean_in_cam.cross(&v_mean_in_cam) + 2.0 * Vector3::new(a.m23, a.m31, a.m12);
     }
-    (splats, [rho.x, rho.y, rho.z, theta.x, theta.y, theta.z])
+    let pose = [rho.x, rho.y, rho.z, theta.x, theta.y, theta.z];
+    (splats, pose, log_focal)
 }
 
 /// To the mean and the covariance in the camera frame.
@@ -67,6 +69,25 @@ fn through_projection(
     }
     v_mean.z += v.z;
     (v_mean, v_covariance_in_cam)
+}
+
+/// The centre's offset from the principal point and the Jacobian are as the focal length; a held slope is as its
+/// inverse.
+fn through_focal(camera: &Camera, splat: &Projected, v: &ProjectedGradient) -> f64 {
+    let k = &camera.intrinsics;
+    let v_covariance_px = -(splat.conic * v.conic * splat.conic);
+    let v_j = 2.0 * v_covariance_px * splat.jacobian * splat.covariance_in_cam;
+    let mut v_log = v.centre_px.x * (splat.centre_px.x - k.cx)
+        + v.centre_px.y * (splat.centre_px.y - k.cy)
+        + v_j.component_mul(&splat.jacobian).sum();
+    let [focal_x, focal_y] = [k.fx, k.fy].map(|focal| focal / splat.mean_in_cam.z);
+    let v_slope = Vector2::new(-focal_x * v_j.m13, -focal_y * v_j.m23);
+    for axis in 0..2 {
+        if splat.is_clamped[axis] {
+            v_log -= v_slope[axis] * splat.slope[axis];
+        }
+    }
+    v_log
 }
 
 /// To the coefficients, and through the viewing direction to the mean relative to the camera centre.

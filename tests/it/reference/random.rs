@@ -8,7 +8,7 @@ use rand_pcg::Pcg64Mcg;
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::frame::{DepthMap, RgbImage};
 use splat_mapper::pose::Rigid;
-use splat_mapper::splat::{Splats, StepSettings, TrainingView};
+use splat_mapper::splat::{PoseStep, Splats, StepSettings, TrainingView};
 
 /// A splat as it is drawn by lot: in the camera frame, sizes in pixels.
 #[derive(Debug, Clone, Copy)]
@@ -60,7 +60,8 @@ pub fn settings() -> StepSettings {
         scale_reg: 0.01,
         sh_degree: 3,
         train_splats: true,
-        train_pose: true,
+        pose: PoseStep::Direct,
+        ..StepSettings::default()
     }
 }
 
@@ -137,6 +138,18 @@ pub fn intrinsics(rng: &mut Pcg64Mcg, width_px: u32, height_px: u32) -> Intrinsi
     }
 }
 
+/// Weights of a third of the pixels are 0, of a third 1, of the rest in between.
+pub fn mask(seed: u64, image: &RgbImage) -> Arc<[u8]> {
+    let mut rng = rng(seed ^ 0x3a5c);
+    let n_pixels = image.pixels.len() / 3;
+    let weights = (0..n_pixels).map(|_| match rng.random_range(0..3) {
+        0 => 0,
+        1 => 255,
+        _ => rng.random(),
+    });
+    weights.collect()
+}
+
 /// Random picture and a coarser depth map with holes; depths agree with the splats' only by chance.
 pub fn view(
     rng: &mut Pcg64Mcg,
@@ -178,5 +191,6 @@ pub fn view(
         intrinsics,
         cam_from_map,
         depth: Some(Arc::new(map)),
+        mask: None,
     }
 }
