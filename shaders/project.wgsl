@@ -1,75 +1,90 @@
-// project: splats -> ellipses on the screen with colour and depth.
-// First stage of a frame. One thread per splat. Equations: docs/GRADIENTS.md, "Projection".
+// project: visible splats -> ellipses on the picture with colour and depth, in order of their index.
+// After cull. One thread per splat. Equations: docs/GRADIENTS.md, projection.
 
-#import camera
-#import quat
+#import step
+#import shape
+#import projected
+#import sh
 
-const NEAR: f32 = 0.01;
-// Screen blur in px^2 that keeps every splat at least about a pixel wide.
-const EPS_2D: f32 = 0.3;
-const MIN_ALPHA: f32 = 1.0 / 255.0;
-const MAX_SIGMAS: f32 = 3.33;
-// Share of the half field of view by which the linearisation point may lie outside the picture.
-const CLAMP_MARGIN: f32 = 0.3;
-const SH_C0: f32 = 0.28209479;
+// A colour beyond this is a broken splat; its square would take SSIM, and with it the whole picture, to infinity.
+const MAX_COLOR: f32 = 1e4;
 
-@group(0) @binding(0) var<uniform> camera: Camera;
-// x, y, z, opacity_logit.
-@group(0) @binding(1) var<storage, read> means: array<vec4<f32>>;
-// Natural logarithm along each own axis; w unused.
-@group(0) @binding(2) var<storage, read> log_scales: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> quats: array<vec4<f32>>;
-// Base colour coefficients; w unused.
-@group(0) @binding(4) var<storage, read> sh_base: array<vec4<f32>>;
-@group(0) @binding(5) var<storage, read_write> projected: array<ProjectedSplat>;
+@group(0) @binding(0) var<uniform> step: Step;
+@group(0) @binding(1) var<storage, read> camera: Camera;
+@group(0) @binding(2) var<storage, read> geometry: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> sh_rest: array<f32>;
+@group(0) @binding(4) var<storage, read> visible_bits: array<u32>;
+@group(0) @binding(5) var<storage, read> block_offsets: array<u32>;
+@group(0) @binding(6) var<storage, read_write> projected: array<Projected>;
+@group(0) @binding(7) var<storage, read_write> depth_keys: array<u32>;
+@group(0) @binding(8) var<storage, read_write> depth_values: array<u32>;
 
-fn covariance_2d(p: vec3<f32>, log_scale: vec3<f32>, quat: vec4<f32>) -> vec3<f32> {
-    let f = camera.pinhole.xy;
-    let c = camera.pinhole.zw;
-    let size = vec2<f32>(f32(camera.width_px), f32(camera.height_px));
-    let margin = CLAMP_MARGIN * 0.5 * size / f;
-    let t = p.z * clamp(p.xy / p.z, -(c / f + margin), (size - c) / f + margin);
-    let rotation = mat3x3<f32>(camera.rotation_x.xyz, camera.rotation_y.xyz, camera.rotation_z.xyz);
-    let scale = exp(log_scale);
-    let axes = rotation * rotation_of(quat);
-    let m = mat3x3<f32>(axes[0] * scale.x, axes[1] * scale.y, axes[2] * scale.z);
-    // Rows of the projection's Jacobian times m.
-    let u = (vec3<f32>(m[0].x, m[1].x, m[2].x) - t.x / p.z * vec3<f32>(m[0].z, m[1].z, m[2].z)) * f.x / p.z;
-    let v = (vec3<f32>(m[0].y, m[1].y, m[2].y) - t.y / p.z * vec3<f32>(m[0].z, m[1].z, m[2].z)) * f.y / p.z;
-    return vec3<f32>(dot(u, u) + EPS_2D, dot(u, v), dot(v, v) + EPS_2D);
+fn color_of(base: vec3<f32>, splat_ix: u32, direction: vec3<f32>) -> vec3<f32> {
+    var color = 0.5 + SH_C0 * base;
+    if step.sh_degree == 0u {
+        return color;
+    }
+    var basis = sh_basis(direction);
+    let first = splat_ix * n_sh_rest(step.sh_stored);
+    let n = n_sh_rest(step.sh_degree) / 3u;
+    for (var b = 0u; b < n; b += 1u) {
+        let at = first + 3u * b;
+        color += basis[b] * vec3<f32>(sh_rest[at], sh_rest[at + 1u], sh_rest[at + 2u]);
+    }
+    return color;
+}
+
+fn count_tiles(splat: Projected, tiles: vec4<u32>) -> u32 {
+    var n = 0u;
+    for (var y = tiles.y; y < tiles.w; y += 1u) {
+        for (var x = tiles.x; x < tiles.z; x += 1u) {
+            n += select(0u, 1u, touches(splat, vec2<u32>(x, y)));
+        }
+    }
+    return n;
 }
 
 @compute @workgroup_size(256)
-fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    let splat_ix = id.x;
-    if splat_ix >= camera.n_splats {
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let block = flat(group, groups);
+    let splat_ix = block * 256u + lane;
+    if splat_ix >= step.n_splats {
         return;
     }
-    projected[splat_ix].depth = 0.0;
-    let p = cam_from_map(camera, means[splat_ix].xyz);
-    let opacity = 1.0 / (1.0 + exp(-means[splat_ix].w));
-    // Written so that a NaN fails the test.
-    if !(p.z > NEAR && opacity >= MIN_ALPHA) {
+    let word = visible_bits[block * 8u + lane / 32u];
+    let bit = 1u << (lane % 32u);
+    if (word & bit) == 0u {
         return;
     }
-    let cov = covariance_2d(p, log_scales[splat_ix].xyz, quats[splat_ix]);
-    let det = cov.x * cov.z - cov.y * cov.y;
-    if !(det > 0.0) {
-        return;
+    var visible_ix = block_offsets[block] + countOneBits(word & (bit - 1u));
+    for (var before = 0u; before < lane / 32u; before += 1u) {
+        visible_ix += countOneBits(visible_bits[block * 8u + before]);
     }
-    let mean_px = camera.pinhole.xy * p.xy / p.z + camera.pinhole.zw;
-    let sigmas = min(MAX_SIGMAS, sqrt(2.0 * log(255.0 * opacity)));
-    let extent_px = ceil(sigmas * sqrt(vec2<f32>(cov.x, cov.z)));
-    let size = vec2<f32>(f32(camera.width_px), f32(camera.height_px));
-    if any(mean_px + extent_px < vec2<f32>(0.0)) || any(mean_px - extent_px > size) {
-        return;
+    let at = 4u * splat_ix;
+    let mean = geometry[at];
+    let size_px = vec2<f32>(f32(step.width_px), f32(step.height_px));
+    let shape = shape_of(camera, mean, geometry[at + 1u], geometry[at + 2u].xyz, size_px);
+    let color = color_of(geometry[at + 3u].xyz, splat_ix, normalize(mean.xyz - camera.center.xyz));
+    let is_sound = is_finite3(color) && all(abs(color) < vec3<f32>(MAX_COLOR));
+    var out: Projected;
+    out.center_px = shape.center_px;
+    out.depth = shape.in_cam.z;
+    out.opacity = select(0.0, shape.opacity, is_sound);
+    out.conic_a = shape.cov.z / shape.det;
+    out.conic_b = -shape.cov.y / shape.det;
+    out.conic_c = shape.cov.x / shape.det;
+    out.splat_ix = splat_ix;
+    out.red = max(color.x, 0.0);
+    out.green = max(color.y, 0.0);
+    out.blue = max(color.z, 0.0);
+    out.cut = shape.cut;
+    out.extent_px = shape.extent_px;
+    out.first_instance = 0u;
+    if is_sound {
+        out.n_tiles = count_tiles(out, tiles_of(out.center_px, out.extent_px, size_px));
     }
-    var out: ProjectedSplat;
-    out.mean_px = mean_px;
-    out.depth = p.z;
-    out.opacity = opacity;
-    out.conic = vec4<f32>(cov.z, -cov.y, cov.x, 0.0) / det;
-    out.colour = max(vec4<f32>(0.5 + SH_C0 * sh_base[splat_ix].xyz, 0.0), vec4<f32>(0.0));
-    out.extent_px = extent_px;
-    projected[splat_ix] = out;
+    projected[visible_ix] = out;
+    // Depths are positive, so that their bits order as they do.
+    depth_keys[visible_ix] = bitcast<u32>(out.depth);
+    depth_values[visible_ix] = visible_ix;
 }

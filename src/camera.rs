@@ -68,6 +68,15 @@ impl Intrinsics {
         }
     }
 
+    /// The same picture with another focal length.
+    pub fn refocused(&self, factor: f64) -> Self {
+        Self {
+            fx: self.fx * factor,
+            fy: self.fy * factor,
+            ..*self
+        }
+    }
+
     /// Finite, positive focal lengths and a principal point within one picture of the centre.
     pub fn is_plausible(&self) -> bool {
         let (w, h) = (f64::from(self.width_px), f64::from(self.height_px));

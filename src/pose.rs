@@ -146,6 +146,40 @@ impl Similarity {
     }
 }
 
+/// The largest distance between two points. Exact up to some thousand points; beyond, at most 0.5 % too small.
+pub fn extent(points: &[DVec3]) -> f64 {
+    const MAX_EXACT: usize = 4000;
+    const N_DIRECTIONS: usize = 512;
+
+    let longest = |points: &[DVec3]| {
+        let pairs = points
+            .iter()
+            .enumerate()
+            .flat_map(|(ix, a)| points[ix + 1..].iter().map(move |b| a.distance_squared(*b)));
+        pairs.fold(0.0, f64::max).sqrt()
+    };
+    if points.len() <= MAX_EXACT {
+        return longest(points);
+    }
+    // The two ends of the longest distance are nearly outermost along one of many even directions: no direction
+    // is further than 0.1 rad from a spiral point of the half sphere, and cos(0.1) = 0.995.
+    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let outermost: Vec<DVec3> = (0..N_DIRECTIONS)
+        .flat_map(|ix| {
+            let z = (ix as f64 + 0.5) / N_DIRECTIONS as f64;
+            let (sin, cos) = (golden_angle * ix as f64).sin_cos();
+            let radius = (1.0 - z * z).sqrt();
+            let direction = DVec3::new(radius * cos, radius * sin, z);
+            let along = |a: &&DVec3, b: &&DVec3| a.dot(direction).total_cmp(&b.dot(direction));
+            [points.iter().min_by(along), points.iter().max_by(along)]
+                .into_iter()
+                .flatten()
+                .copied()
+        })
+        .collect();
+    longest(&outermost)
+}
+
 /// `skew(a) * b == a.cross(b)`.
 pub fn skew(a: DVec3) -> DMat3 {
     DMat3::from_cols(

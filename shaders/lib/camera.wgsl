@@ -1,4 +1,4 @@
-// A pinhole camera and how splats become visible in it. Mirrored by gpu/types.rs.
+// A pinhole at a pose, and how the picture is compared. Written by `camera` or by the host. Mirrored by gpu/types.rs.
 
 struct Camera {
     // Columns of the rotation of cam_from_map; w unused.
@@ -7,31 +7,27 @@ struct Camera {
     rotation_z: vec4<f32>,
     // Translation of cam_from_map; w unused.
     translation: vec4<f32>,
+    // Of the camera in the map; w unused.
+    center: vec4<f32>,
     // fx, fy, cx, cy in pixels; the first pixel's centre is at 0.5.
     pinhole: vec4<f32>,
-    width_px: u32,
-    height_px: u32,
-    n_splats: u32,
-    sh_degree: u32,
+    // Bounds of x/z and y/z in the Jacobian: x min, y min, x max, y max.
+    slope_bounds: vec4<f32>,
+    // Colour that is compared = gain * rendered + offset; w unused.
+    gain: vec4<f32>,
+    offset: vec4<f32>,
+    n_visible: u32,
+    n_instances: u32,
+    // 1 once a step needed more instances than there is room for; steps do nothing until the host has grown it.
+    is_full: u32,
+    n_wanted: u32,
+    // Pictures since the host last looked that had room.
+    n_done: u32,
+    padding_0: u32,
+    padding_1: u32,
+    padding_2: u32,
 }
 
-// One splat on the screen.
-struct ProjectedSplat {
-    // Pixels.
-    mean_px: vec2<f32>,
-    // z in the camera, map units; 0 marks a splat that is not visible.
-    depth: f32,
-    opacity: f32,
-    // Upper triangle a, b, c of the inverse 2D covariance; w unused.
-    conic: vec4<f32>,
-    // r, g, b; w unused.
-    colour: vec4<f32>,
-    // Half sides in pixels of the box outside which alpha stays below 1/255.
-    extent_px: vec2<f32>,
-    padding: vec2<f32>,
-}
-
-fn cam_from_map(camera: Camera, mean_in_map: vec3<f32>) -> vec3<f32> {
-    let rotation = mat3x3<f32>(camera.rotation_x.xyz, camera.rotation_y.xyz, camera.rotation_z.xyz);
-    return rotation * mean_in_map + camera.translation.xyz;
+fn rotation_of_camera(camera: Camera) -> mat3x3<f32> {
+    return mat3x3<f32>(camera.rotation_x.xyz, camera.rotation_y.xyz, camera.rotation_z.xyz);
 }

@@ -1,12 +1,7 @@
 // Quaternions stored w, x, y, z.
 
-// Rotation matrix of a quaternion of any length; zero length is the identity.
-fn rotation_of(quat: vec4<f32>) -> mat3x3<f32> {
-    let length_sq = dot(quat, quat);
-    var q = vec4<f32>(1.0, 0.0, 0.0, 0.0);
-    if length_sq > 1e-30 {
-        q = quat * inverseSqrt(length_sq);
-    }
+// Rotation matrix of a unit quaternion.
+fn rotation_of(q: vec4<f32>) -> mat3x3<f32> {
     let w = q.x;
     let x = q.y;
     let y = q.z;
@@ -16,4 +11,10 @@ fn rotation_of(quat: vec4<f32>) -> mat3x3<f32> {
         vec3<f32>(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
         vec3<f32>(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     );
+}
+
+// Hamilton product: rotates by b, then by a.
+fn quat_product(a: vec4<f32>, b: vec4<f32>) -> vec4<f32> {
+    let v = a.x * b.yzw + b.x * a.yzw + cross(a.yzw, b.yzw);
+    return vec4<f32>(a.x * b.x - dot(a.yzw, b.yzw), v);
 }

@@ -1,5 +1,38 @@
-//! Shaders and what the host must know of them. Speaks to no device: this build maps on the CPU, and the shaders
-//! are kept valid by `tests/it/shaders.rs` against the table in `kernel`.
+//! The GPU as a calculator: an adapter, typed buffers, the table of shaders, and the recording of their dispatches.
+//!
+//! The only home of wgpu. Knows what a splat looks like in memory (`types`), not what is done with it.
 
+pub mod buffer;
+pub mod commands;
+pub mod device;
 pub mod kernel;
 pub mod types;
+
+/// Why there is no GPU to work with, or why it does not do.
+#[derive(Debug, thiserror::Error)]
+pub enum GpuError {
+    #[error(
+        "no GPU adapter answers{}: install a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers), or use --backend cpu",
+        if *any_kind { "" } else { " that is hardware" }
+    )]
+    NoAdapter { any_kind: bool },
+    #[error("adapter {adapter:?} gives no device: {reason}; use --backend cpu")]
+    NoDevice { adapter: String, reason: String },
+    #[error("shader {name:?} does not compile on adapter {adapter:?}: {reason}; use --backend cpu")]
+    Shader {
+        name: &'static str,
+        adapter: String,
+        reason: String,
+    },
+    #[error(
+        "{needed} bytes for {what} are more than the {limit} that adapter {adapter:?} allows in one buffer; fewer splats or --backend cpu"
+    )]
+    TooLarge {
+        what: &'static str,
+        needed: u64,
+        limit: u64,
+        adapter: String,
+    },
+    #[error("adapter {adapter:?} did not finish within {secs} s; use --backend cpu")]
+    Hangs { adapter: String, secs: u64 },
+}

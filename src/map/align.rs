@@ -5,6 +5,8 @@
 use glam::{DQuat, DVec3};
 
 use crate::pose::{Rigid, Similarity};
+use crate::splat::Splats;
+use crate::splat::sh_rotation::ShRotation;
 
 /// Camera centres closer together than this share of their distance to the scene say nothing about scale.
 const MIN_SPREAD: f64 = 1e-6;
@@ -74,18 +76,36 @@ fn mean_rotation(rotations: impl Iterator<Item = DQuat>) -> DQuat {
     }
 }
 
-/// Carries a splat along when the pose that it was seeded from moves: mean and quaternion (w,x,y,z).
-pub fn carry(motion: &Rigid, mean: &mut [f32; 3], quat: &mut [f32; 4]) {
-    let moved = motion.transform_point(DVec3::from(mean.map(f64::from)));
-    *mean = moved.as_vec3().to_array();
-    let [w, x, y, z] = quat.map(f64::from);
-    let turned = motion.rotation * DQuat::from_xyzw(x, y, z, w);
-    *quat = [
-        turned.w as f32,
-        turned.x as f32,
-        turned.y as f32,
-        turned.z as f32,
-    ];
+/// A motion of cameras that carries splats along: their means, orientations and view-dependent colours.
+#[derive(Debug, Clone)]
+pub struct Carry {
+    motion: Rigid,
+    bands: ShRotation,
+}
+
+impl Carry {
+    /// For splats of this SH degree.
+    pub fn new(motion: Rigid, sh_degree: u8) -> Self {
+        Self {
+            bands: ShRotation::new(motion.rotation, sh_degree),
+            motion,
+        }
+    }
+
+    /// Moves splat `i`.
+    pub fn carry(&self, splats: &mut Splats, i: usize) {
+        let mean = &mut splats.means[i];
+        let moved = self
+            .motion
+            .transform_point(DVec3::from(mean.map(f64::from)));
+        *mean = moved.as_vec3().to_array();
+        let [w, x, y, z] = splats.quats[i].map(f64::from);
+        let turned = self.motion.rotation * DQuat::from_xyzw(x, y, z, w);
+        splats.quats[i] = [turned.w, turned.x, turned.y, turned.z].map(|v| v as f32);
+        let stride = splats.sh_stride();
+        self.bands
+            .apply(&mut splats.sh[i * stride..(i + 1) * stride]);
+    }
 }
 
 #[cfg(test)]
@@ -136,13 +156,21 @@ mod tests {
         let (old, new) = (pose(1.0), pose(1.2));
         let motion = new * old.inverse();
         let in_cam = DVec3::new(0.1, 0.2, 2.0);
-        let mut mean = old.transform_point(in_cam).as_vec3().to_array();
-        let mut quat = [1.0, 0.0, 0.0, 0.0];
-        carry(&motion, &mut mean, &mut quat);
+        let mut splats = Splats {
+            means: vec![old.transform_point(in_cam).as_vec3().to_array()],
+            log_scales: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            opacity_logits: vec![0.0],
+            sh: vec![0.5; 12],
+            sh_degree: 1,
+            anchors: vec![0],
+        };
+        Carry::new(motion, 1).carry(&mut splats, 0);
         let back = new
             .inverse()
-            .transform_point(DVec3::from(mean.map(f64::from)));
+            .transform_point(DVec3::from(splats.means[0].map(f64::from)));
         assert!((back - in_cam).length() < 1e-5, "{back}");
-        assert!((f64::from(quat[0]) - motion.rotation.w.abs()).abs() < 1e-6);
+        assert!((f64::from(splats.quats[0][0]) - motion.rotation.w.abs()).abs() < 1e-6);
+        assert_eq!(splats.sh[..3], [0.5; 3]);
     }
 }

@@ -1,13 +1,22 @@
-//! Splats come where a view shows holes or errors, and go when they have become transparent.
+//! Splats come where a view shows holes or errors, and go, or move, when they have become transparent.
 
 use rand::RngExt;
 
 use crate::map::SplatMap;
 use crate::map::schedule::Phase;
 use crate::map::seed::{self, SeedView};
+use crate::map::transient;
+use crate::splat::{McmcSettings, Rendering};
+
+/// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
+/// is not under optimisation, and its splats are no measure of anything.
+const ACTIVE_ROUNDS: usize = 4;
+const MIN_ACTIVE_STEPS: usize = 500;
+/// Share of the cap that is open when the first frames come; all of it is at the end of the input.
+const FIRST_ROOM: f64 = 0.25;
 
 impl SplatMap {
-    /// Looks at one training view, and seeds where the map has a hole or is wrong.
+    /// Looks at one training view: seeds where the map has a hole or is wrong, and notes what has moved in it.
     pub(super) fn reseed(&mut self, phase: Phase) {
         if self.trainable.is_empty() {
             return;
@@ -20,11 +29,17 @@ impl SplatMap {
             .find(|(_, p)| p.view_ix == view_ix)
             .map(|(id, _)| *id);
         if let Some(id) = id {
-            self.seed_from(id, phase != Phase::Streaming, None);
+            self.mask_transients(id);
+            self.seed_from(id, phase != Phase::Streaming);
         }
     }
 
-    pub(super) fn seed_from(&mut self, keyframe_id: u32, fills_gaps: bool, progress: Option<f64>) {
+    pub(super) fn seed_from(&mut self, keyframe_id: u32, fills_gaps: bool) {
+        let room = self.cap().saturating_sub(self.engine.n_splats());
+        if room == 0 {
+            return;
+        }
+        let rendering = self.shown(keyframe_id, 0);
         let Some(placed) = self
             .keyframes
             .placed
@@ -33,21 +48,11 @@ impl SplatMap {
         else {
             return;
         };
-        // While the end is known to be far, part of the cap is kept for what is still to be seen.
-        let share = progress.map_or(1.0, |p| (0.25 + p).min(1.0));
-        let cap = (self.params.max_splats as f64 * share) as usize;
-        let room = cap.saturating_sub(self.engine.n_splats());
-        if room == 0 {
-            return;
-        }
-        let cam_from_map = self.engine.poses()[placed.view_ix];
-        let rendering = (self.engine.n_splats() > 0)
-            .then(|| self.engine.render(&placed.intrinsics, &cam_from_map, 0));
         let view = SeedView {
             keyframe_id,
             image: &placed.image,
-            intrinsics: &placed.intrinsics,
-            map_from_cam: &cam_from_map.inverse(),
+            intrinsics: &placed.intrinsics.refocused(self.engine.focal_factor()),
+            map_from_cam: &self.engine.poses()[placed.view_ix].inverse(),
             depth: &placed.depth,
             rendering: rendering.as_ref(),
             fills_gaps,
@@ -64,16 +69,59 @@ impl SplatMap {
         }
     }
 
-    /// Removes splats that have become transparent or lost their numbers.
+    /// Removes splats that have become transparent or lost their numbers; the transparent ones move with MCMC.
     pub(super) fn prune(&mut self) {
         let splats = self.engine.splats();
         let min_opacity = self.params.min_opacity.clamp(1e-6, 1.0 - 1e-6);
         let min_logit = (min_opacity / (1.0 - min_opacity)).ln();
+        let is_alive = |i: usize| self.params.mcmc || splats.opacity_logits[i] > min_logit;
         let keep: Vec<bool> = (0..splats.len())
-            .map(|i| splats.is_finite(i) && splats.opacity_logits[i] > min_logit)
+            .map(|i| splats.is_finite(i) && is_alive(i))
             .collect();
         if keep.iter().any(|k| !k) {
             self.engine.retain(&keep);
+        }
+    }
+
+    /// Transparent splats move to where others are, and some are added (3DGS-MCMC).
+    pub(super) fn relocate(&mut self) {
+        let active_steps = (ACTIVE_ROUNDS * self.trainable.len()).max(MIN_ACTIVE_STEPS);
+        let settings = McmcSettings {
+            min_opacity: self.params.min_opacity,
+            max_splats: self.cap(),
+            growth: self.params.growth,
+            active_steps: active_steps as u32,
+            seed: (self.seed ^ self.n_steps) as u32,
+        };
+        self.engine.relocate_and_grow(&settings);
+    }
+
+    /// While the end is known to be far, part of the room is kept for what is still to be seen.
+    fn cap(&self) -> usize {
+        let share = self.progress.map_or(1.0, |p| (FIRST_ROOM + p).min(1.0));
+        (self.params.max_splats as f64 * share) as usize
+    }
+
+    /// What the map shows in a keyframe; `None` for an empty map.
+    fn shown(&mut self, keyframe_id: u32, sh_degree: u8) -> Option<Rendering> {
+        let placed = self.keyframes.placed.get(&keyframe_id)?;
+        if self.engine.n_splats() == 0 {
+            return None;
+        }
+        let cam_from_map = self.engine.poses()[placed.view_ix];
+        let intrinsics = placed.intrinsics.refocused(self.engine.focal_factor());
+        Some(self.engine.render(&intrinsics, &cam_from_map, sh_degree))
+    }
+
+    fn mask_transients(&mut self, keyframe_id: u32) {
+        if self.params.transient >= 1.0 {
+            return;
+        }
+        let rendering = self.shown(keyframe_id, self.params.sh_degree);
+        let placed = self.keyframes.placed.get(&keyframe_id);
+        if let Some((placed, rendering)) = placed.zip(rendering) {
+            let mask = transient::mask(&placed.image, &rendering, self.params.transient);
+            self.engine.set_mask(placed.view_ix, mask);
         }
     }
 }

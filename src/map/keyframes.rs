@@ -22,6 +22,9 @@ pub struct Placed {
     /// In map units, and its median.
     pub depth: Arc<DepthMap>,
     pub median_depth: Option<f32>,
+    /// What the map made of the model's depth, and how often it was asked.
+    pub depth_factor: f64,
+    pub n_depth_looks: u8,
     pub health: Health,
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,
@@ -35,6 +38,8 @@ pub struct Keyframes {
     pub waiting: BTreeMap<u32, Arc<Keyframe>>,
     /// Placed by the model, but in a component that has no known relation to the map.
     pub foreign: BTreeMap<u32, View>,
+    /// By landmark, the pixel in the keyframe's picture; kept only where the map has a use for matches.
+    pub sightings: BTreeMap<u32, BTreeMap<u32, [f32; 2]>>,
 }
 
 impl Keyframes {
@@ -61,10 +66,12 @@ impl Keyframes {
         counts
     }
 
-    /// (pose in the map, pose in the model's frame) of all that are placed; `map_poses` by view index.
+    /// (pose in the map, pose in the model's frame) of all that are optimised, else of all; `map_poses` by view index.
     pub fn pose_pairs(&self, map_poses: &[Rigid]) -> Vec<(Rigid, Rigid)> {
+        let no_choice = self.placed.values().all(|p| p.is_held_out);
         self.placed
             .values()
+            .filter(|p| no_choice || !p.is_held_out)
             .map(|p| (map_poses[p.view_ix].inverse(), p.model_from_cam))
             .collect()
     }

@@ -5,13 +5,18 @@
 
 pub mod align;
 pub mod checkpoint;
+mod depth_scale;
+mod gauge;
 mod growth;
+mod held_out;
 pub mod keyframes;
 pub mod layout;
+mod matches;
 mod revise;
 pub mod schedule;
 pub mod seed;
 pub mod snapshot;
+mod transient;
 
 use std::sync::Arc;
 
@@ -20,13 +25,13 @@ use rand_pcg::Pcg64Mcg;
 use sha2::{Digest, Sha256};
 
 use crate::config::MapParams;
-use crate::frame::{Batch, RgbImage};
-use crate::geometry::{GeometryBatch, View};
+use crate::frame::Batch;
+use crate::geometry::{GeometryBatch, PoseError, View};
+use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
 use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
-use crate::pose::{Rigid, Similarity};
-use crate::splat::{Engine, Rendering, StepSettings, TrainingView};
+use crate::splat::{Engine, PoseStep, StepSettings, TrainingView};
 
 /// Keyframes without a pose that are kept in case the model places them later.
 pub const MAX_WAITING: usize = 200;
@@ -38,11 +43,6 @@ const FIRST_NOTE_EVERY: u64 = 20;
 const MAX_CURVE: usize = 400;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to settle.
 const LAST_RESEED: f32 = 0.6;
-/// Steps that refine the pose of one held-out view, and its first rates (3R-GS: 100 steps, decay to 1 %).
-const HELD_OUT_STEPS: u32 = 60;
-const HELD_OUT_RATE: f32 = 5e-4;
-const HELD_OUT_FINAL_RATE: f32 = 0.01;
-
 /// All splats and poses, and the engine that improves them.
 pub struct SplatMap {
     params: MapParams,
@@ -56,6 +56,13 @@ pub struct SplatMap {
     component: Option<u32>,
     /// Median depth of the views, map units.
     scene_depth: f32,
+    /// What the model says that poses may be off by: radians, and map units.
+    pose_error: [f32; 2],
+    /// `None` before views were placed.
+    gauge: Option<Gauge>,
+    n_put_back: u64,
+    /// Share of the input that has come, while more is to come and where it is known.
+    progress: Option<f64>,
     scale: ScaleSource,
     seed: u64,
     epoch: u32,
@@ -88,6 +95,10 @@ impl SplatMap {
             trainable: Vec::new(),
             component: None,
             scene_depth: 1.0,
+            pose_error: [0.0; 2],
+            gauge: None,
+            n_put_back: 0,
+            progress: None,
             scale,
             seed,
             epoch: 0,
@@ -109,7 +120,10 @@ impl SplatMap {
         if let Some(batch) = batch {
             self.keyframes.remember(&batch.keyframes, MAX_WAITING);
         }
+        self.progress = progress;
+        self.hold_gauge();
         self.revise(&geometry);
+        self.note_sightings(geometry.sightings);
         let mut own = Vec::new();
         for view in geometry.views {
             let component = *self.component.get_or_insert(view.component);
@@ -121,17 +135,23 @@ impl SplatMap {
             }
         }
         own.extend(self.take_over());
-        self.place(own, progress)
+        let fresh = self.place(own, geometry.pose_error);
+        self.match_views();
+        self.set_gauge();
+        fresh
     }
 
     /// One optimiser update per step, with seeding and removal at their intervals. Returns the steps made, which
     /// are fewer only when there is nothing to train on.
     pub fn step(&mut self, n: u64, phase: Phase) -> u64 {
+        if phase != Phase::Streaming {
+            self.progress = None;
+        }
         for done in 0..n {
             let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
                 return done;
             };
-            let settings = schedule::settings(&self.params, self.scene_depth, phase);
+            let settings = self.step_settings(phase);
             self.engine.step(view_ix, &settings);
             self.n_steps += 1;
             let may_change = !matches!(phase, Phase::Final(share) if share > LAST_RESEED);
@@ -144,6 +164,16 @@ impl SplatMap {
             if may_change && self.n_steps.is_multiple_of(PRUNE_EVERY) {
                 self.prune();
             }
+            let may_move = may_change && self.params.mcmc && self.n_steps >= self.params.mcmc_start;
+            if may_move && self.n_steps.is_multiple_of(self.params.mcmc_every) {
+                self.relocate();
+            }
+            if self.n_steps.is_multiple_of(GAUGE_EVERY) {
+                if settings.pose != PoseStep::Held {
+                    self.hold_gauge();
+                }
+                self.fit_depths();
+            }
         }
         n
     }
@@ -151,6 +181,7 @@ impl SplatMap {
     /// Poses and splats as they are.
     pub fn snapshot(&mut self) -> Arc<Snapshot> {
         let map_from_cams = self.engine.poses();
+        let focal_factor = self.engine.focal_factor();
         let poses: Vec<KeyframePose> = self
             .keyframes
             .placed
@@ -159,7 +190,7 @@ impl SplatMap {
                 keyframe_id: placed.keyframe.id,
                 stamp: placed.keyframe.frame.stamp,
                 map_from_cam: map_from_cams[placed.view_ix].inverse(),
-                intrinsics: placed.intrinsics,
+                intrinsics: placed.intrinsics.refocused(focal_factor),
             })
             .collect();
         self.revision += 1;
@@ -172,50 +203,6 @@ impl SplatMap {
             poses,
             splats: Arc::new(self.engine.splats().into_finite()),
         })
-    }
-
-    /// Moves each held-out view, alone and with the splats frozen, to where its picture fits best.
-    pub fn refine_held_out(&mut self) {
-        self.note_loss();
-        let held_out: Vec<usize> = self
-            .keyframes
-            .placed
-            .values()
-            .filter(|p| p.is_held_out)
-            .map(|p| p.view_ix)
-            .collect();
-        let last = schedule::settings(&self.params, self.scene_depth, Phase::Final(1.0));
-        for view_ix in held_out {
-            for step in 0..HELD_OUT_STEPS {
-                let rate =
-                    HELD_OUT_RATE * HELD_OUT_FINAL_RATE.powf(step as f32 / HELD_OUT_STEPS as f32);
-                let settings = StepSettings {
-                    train_splats: false,
-                    train_pose: true,
-                    lr_pose_rotation: rate,
-                    lr_pose_translation: rate * self.scene_depth,
-                    depth_weight: 0.0,
-                    ..last.clone()
-                };
-                self.engine.step(view_ix, &settings);
-            }
-        }
-        // These steps are no training: their losses must not enter the curve.
-        self.engine.take_stats();
-    }
-
-    /// What the map shows from a keyframe, beside the picture that was taken there.
-    pub fn render_keyframe(&mut self, keyframe_id: u32) -> Option<(Rendering, Arc<RgbImage>)> {
-        let (view_ix, intrinsics, image) = {
-            let placed = self.keyframes.placed.get(&keyframe_id)?;
-            (placed.view_ix, placed.intrinsics, Arc::clone(&placed.image))
-        };
-        let cam_from_map = self.engine.poses()[view_ix];
-        let sh_degree = self.params.sh_degree;
-        Some((
-            self.engine.render(&intrinsics, &cam_from_map, sh_degree),
-            image,
-        ))
     }
 
     /// (id, is held out) of every keyframe in the map.
@@ -254,6 +241,15 @@ impl SplatMap {
         self.n_steps
     }
 
+    /// What has broken for good in the engine.
+    pub fn fault(&self) -> Option<String> {
+        self.engine.fault()
+    }
+
+    pub fn peak_gpu_bytes(&self) -> u64 {
+        self.engine.peak_gpu_bytes()
+    }
+
     pub fn adapter(&self) -> String {
         self.engine.adapter()
     }
@@ -261,6 +257,10 @@ impl SplatMap {
     /// (step, mean loss since the one before).
     pub fn loss_curve(&self) -> &[(u64, f64)] {
         &self.loss_curve
+    }
+
+    fn step_settings(&self, phase: Phase) -> StepSettings {
+        schedule::settings(&self.params, self.scene_depth, self.pose_error, phase)
     }
 
     fn map_id(&self) -> [u8; 16] {
@@ -279,15 +279,20 @@ impl SplatMap {
     }
 
     /// Gives views of the map's own component their place, and seeds splats from them.
-    fn place(&mut self, views: Vec<View>, progress: Option<f64>) -> Vec<u32> {
+    fn place(&mut self, views: Vec<View>, pose_error: PoseError) -> Vec<u32> {
         if views.is_empty() {
             return Vec::new();
         }
         let map_poses = self.engine.poses();
         let map_from_model = self.map_from_model(&map_poses);
+        self.pose_error[1] =
+            self.pose_error[1].max((pose_error.translation * map_from_model.scale) as f32);
+        self.pose_error[0] = self.pose_error[0].max(pose_error.rotation_rad as f32);
         let mut fresh = Vec::new();
         for view in views {
-            let depth = Arc::new(keyframes::rescaled(&view.depth, map_from_model.scale));
+            let given = self.keyframes.placed.get(&view.keyframe_id);
+            let factor = map_from_model.scale * given.map_or(1.0, |placed| placed.depth_factor);
+            let depth = Arc::new(keyframes::rescaled(&view.depth, factor));
             let median_depth = depth.median();
             if let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) {
                 // A shared keyframe: more neighbours have verified its depth since.
@@ -306,9 +311,11 @@ impl SplatMap {
                     intrinsics,
                     cam_from_map,
                     depth: Some(Arc::clone(&depth)),
+                    mask: None,
                 });
                 let every = self.params.holdout;
-                let is_held_out = every > 0 && view.keyframe_id % every == every / 2;
+                let is_held_out = keyframe.frame.is_held_out
+                    || (every > 0 && view.keyframe_id % every == every / 2);
                 let id = view.keyframe_id;
                 self.keyframes.placed.insert(
                     id,
@@ -320,6 +327,8 @@ impl SplatMap {
                         intrinsics,
                         depth,
                         median_depth,
+                        depth_factor: 1.0,
+                        n_depth_looks: 0,
                         health: view.health,
                         is_held_out,
                     },
@@ -333,14 +342,9 @@ impl SplatMap {
         self.measure_scene();
         self.prune();
         for id in &fresh {
-            self.seed_from(*id, false, progress);
+            self.seed_from(*id, false);
         }
         fresh
-    }
-
-    /// From the poses that the model gave to where the same cameras stand; `map_poses` by view index.
-    fn map_from_model(&self, map_poses: &[Rigid]) -> Similarity {
-        align::align(&self.keyframes.pose_pairs(map_poses)).unwrap_or(Similarity::IDENTITY)
     }
 
     fn measure_scene(&mut self) {

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::geometry::{GeometryBatch, View};
+use crate::geometry::{GeometryBatch, PoseError, Revision, View};
+use crate::map::align::Carry;
 use crate::map::{SplatMap, align, keyframes};
 use crate::pose::Rigid;
 
@@ -22,18 +23,31 @@ impl SplatMap {
         let map_from_model = self.map_from_model(&map_poses);
         let mut motions = BTreeMap::new();
         let mut joined = Vec::new();
-        for (id, component, model_from_cam) in &geometry.revised {
+        for revision in &geometry.revised {
+            let Revision {
+                keyframe_id: id,
+                component,
+                batch_from_cam: model_from_cam,
+                intrinsics,
+            } = revision;
             if let Some(view) = self.keyframes.foreign.get_mut(id) {
                 if Some(*component) == self.component {
                     joined.push((view.component, *id, *model_from_cam));
                 } else {
                     (view.component, view.batch_from_cam) = (*component, *model_from_cam);
                 }
+                view.intrinsics = *intrinsics;
                 continue;
             }
             let Some(placed) = self.keyframes.placed.get_mut(id) else {
                 continue;
             };
+            let image = &placed.image;
+            let intrinsics = intrinsics.resized(image.width_px, image.height_px);
+            if intrinsics != placed.intrinsics {
+                placed.intrinsics = intrinsics;
+                self.engine.set_intrinsics(placed.view_ix, &intrinsics);
+            }
             let model_motion = *model_from_cam * placed.model_from_cam.inverse();
             placed.model_from_cam = *model_from_cam;
             let angle = model_motion.angle_to(&Rigid::IDENTITY);
@@ -47,9 +61,13 @@ impl SplatMap {
         }
         if !motions.is_empty() {
             let mut splats = self.engine.splats();
+            let carries: BTreeMap<u32, Carry> = motions
+                .into_iter()
+                .map(|(id, motion)| (id, Carry::new(motion, splats.sh_degree)))
+                .collect();
             for i in 0..splats.len() {
-                if let Some(motion) = motions.get(&splats.anchors[i]) {
-                    align::carry(motion, &mut splats.means[i], &mut splats.quats[i]);
+                if let Some(carry) = carries.get(&splats.anchors[i]) {
+                    carry.carry(&mut splats, i);
                 }
             }
             self.engine.overwrite(&splats);
@@ -82,7 +100,7 @@ impl SplatMap {
                 });
             }
         }
-        self.place(views, None);
+        self.place(views, PoseError::default());
     }
 
     /// When another component has grown far beyond the map's, the map starts again from it.
@@ -116,6 +134,7 @@ impl SplatMap {
             self.keyframes.waiting.insert(id, placed.keyframe);
         }
         self.trainable.clear();
+        self.gauge = None;
         self.schedule.restart_round();
         self.component = Some(component);
         self.epoch += 1;

@@ -4,8 +4,8 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::config::MapParams;
-use crate::splat::StepSettings;
+use crate::config::{DepthLoss, MapParams, PoseRefinement};
+use crate::splat::{DepthMode, PoseStep, StepSettings};
 
 /// Share of the steps between arrivals that train on the newest views.
 const NEWEST_SHARE: f64 = 0.5;
@@ -13,10 +13,12 @@ const NEWEST_SHARE: f64 = 0.5;
 const N_NEWEST: usize = 8;
 /// Rates at the last step, as a share of those at the first.
 const FINAL_MEAN_RATE: f32 = 0.01;
-const FINAL_POSE_RATE: f32 = 0.1;
+const FINAL_POSE_RATE: f32 = 0.03;
 const FINAL_DEPTH_WEIGHT: f32 = 0.1;
 /// Between arrivals poses move slowly: splats that have just been seeded would pull them about.
 const STREAMING_POSE_RATE: f32 = 0.2;
+/// First pose rate as a share of the standard deviation that the model states: some ten steps of a view cover it.
+const RATE_OF_ERROR: f32 = 0.3;
 /// Bands above the base colour wait until the geometry has settled (3DGS trains them late).
 const SH_START: f32 = 0.3;
 /// Rate of the SH bands above the base, as a share of the base rate (3DGS).
@@ -72,7 +74,20 @@ pub fn due(params: &MapParams, progress: f64) -> u64 {
 }
 
 /// Numbers of one step. `scene_depth` is the median depth of the views in map units: lengths scale with it.
-pub fn settings(params: &MapParams, scene_depth: f32, phase: Phase) -> StepSettings {
+/// `pose_error` is what the model says that poses may be off by, in radians and map units: the farther, the faster.
+pub fn settings(
+    params: &MapParams,
+    scene_depth: f32,
+    pose_error: [f32; 2],
+    phase: Phase,
+) -> StepSettings {
+    let raised = |rate: f32, error: f32| {
+        if rate > 0.0 {
+            rate.max(RATE_OF_ERROR * error)
+        } else {
+            0.0
+        }
+    };
     let done = match phase {
         Phase::Streaming => 0.0,
         Phase::Final(share) => share.clamp(0.0, 1.0),
@@ -83,24 +98,54 @@ pub fn settings(params: &MapParams, scene_depth: f32, phase: Phase) -> StepSetti
     } else {
         1.0
     };
-    let sh_is_on = phase != Phase::Streaming && done >= SH_START;
+    // A splat's own age says when its bands start; else all wait together.
+    let sh_is_on = params.sh_interval > 0 || (phase != Phase::Streaming && done >= SH_START);
+    let lr_mean = decayed(params.lr_mean * scene_depth, FINAL_MEAN_RATE);
+    let if_mcmc = |value: f32| if params.mcmc { value } else { 0.0 };
     StepSettings {
-        lr_mean: decayed(params.lr_mean * scene_depth, FINAL_MEAN_RATE),
+        lr_mean,
         lr_scale: params.lr_scale,
         lr_quat: params.lr_quat,
         lr_opacity: params.lr_opacity,
         lr_sh0: params.lr_sh,
         lr_sh_rest: params.lr_sh * SH_REST_RATE,
-        lr_pose_rotation: pose_share * decayed(params.lr_rotation, FINAL_POSE_RATE),
+        lr_pose_rotation: pose_share
+            * decayed(raised(params.lr_rotation, pose_error[0]), FINAL_POSE_RATE),
         lr_pose_translation: pose_share
-            * decayed(params.lr_translation * scene_depth, FINAL_POSE_RATE),
+            * decayed(
+                raised(params.lr_translation * scene_depth, pose_error[1]),
+                FINAL_POSE_RATE,
+            ),
+        lr_refiner: pose_share * decayed(params.lr_refiner, FINAL_POSE_RATE),
+        lr_focal: pose_share * decayed(params.lr_focal, FINAL_POSE_RATE),
+        lr_exposure: params.lr_exposure,
         ssim_weight: params.ssim_weight,
         depth_weight: decayed(params.depth_weight, FINAL_DEPTH_WEIGHT),
-        opacity_reg: params.opacity_reg,
-        scale_reg: params.scale_reg,
+        depth_mode: match params.depth_mode {
+            DepthLoss::InvDepth => DepthMode::InverseDepth,
+            DepthLoss::PaperCode => DepthMode::PaperCode,
+            DepthLoss::PaperAlpha => DepthMode::PaperAlpha,
+        },
+        epipolar_weight: params.epipolar_weight,
+        opacity_reg: if_mcmc(params.opacity_reg),
+        // A scale is a length: its share of the scene is what has a size.
+        scale_reg: if_mcmc(params.scale_reg / scene_depth.max(f32::MIN_POSITIVE)),
+        noise: if_mcmc(lr_mean * params.noise),
         sh_degree: if sh_is_on { params.sh_degree } else { 0 },
+        sh_interval: params.sh_interval,
         train_splats: true,
-        train_pose: params.lr_rotation > 0.0 || params.lr_translation > 0.0,
+        pose: pose_step(params),
+        ..StepSettings::default()
+    }
+}
+
+fn pose_step(params: &MapParams) -> PoseStep {
+    match params.pose {
+        PoseRefinement::Direct if params.lr_rotation > 0.0 || params.lr_translation > 0.0 => {
+            PoseStep::Direct
+        }
+        PoseRefinement::Shared if params.lr_refiner > 0.0 => PoseStep::Shared,
+        _ => PoseStep::Held,
     }
 }
 
@@ -138,7 +183,7 @@ mod tests {
     #[test]
     fn rates_decay_only_after_the_last_keyframe() {
         let params = Settings::shipped().params().unwrap().map;
-        let at = |phase| settings(&params, 2.0, phase);
+        let at = |phase| settings(&params, 2.0, [0.0; 2], phase);
         assert_eq!(at(Phase::Streaming).lr_mean, at(Phase::Final(0.0)).lr_mean);
         assert!((at(Phase::Final(1.0)).lr_mean / at(Phase::Streaming).lr_mean - 0.01).abs() < 1e-6);
         assert_eq!(at(Phase::Streaming).sh_degree, 0);

@@ -1,0 +1,21 @@
+// One pass of MCMC moves (Kheradmand et al. 2024): what the host says of it. Mirrored by gpu/types.rs.
+// The arithmetic is that of src/splat/mcmc.rs.
+
+struct Moves {
+    n_splats: u32,
+    // Places to fill behind the last splat; 0: the places of the dead are filled.
+    n_added: u32,
+    seed: u32,
+    // Third word of the hash: which draw it is for.
+    kind: u32,
+    weight_bits: u32,
+    active_steps: u32,
+    n_steps: u32,
+    sh_stored: u32,
+    min_opacity: f32,
+    padding_0: f32,
+    padding_1: f32,
+    padding_2: f32,
+}
+
+const NOBODY: u32 = 0xffffffffu;

@@ -1,0 +1,13 @@
+// SSIM's window (Wang et al. 2004): 11 x 11 Gaussian of sigma 1.5 px, pictures count as 0 beyond their edges.
+
+const REACH: i32 = 5;
+// Normalised.
+const WINDOW = array<f32, 11>(
+    0.00102838, 0.007598758, 0.036000773, 0.10936069, 0.21300554, 0.26601172,
+    0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.00102838,
+);
+// Stabilisers for values of range 1.
+const C1: f32 = 1e-4;
+const C2: f32 = 9e-4;
+// Neighbouring pixels along the blur that one thread makes; they share most of what they load.
+const RUN: u32 = 4u;

@@ -1,0 +1,36 @@
+// What the engine keeps of a view, and of all views together. Mirrored by gpu/types.rs.
+
+// Places of one view's numbers, and how many there are.
+const VIEW_QUAT: u32 = 0u;
+const VIEW_TRANSLATION: u32 = 4u;
+const VIEW_PINHOLE: u32 = 8u;
+// Log gain and offset of r, g, b.
+const VIEW_EXPOSURE: u32 = 12u;
+const VIEW_POSE_M: u32 = 18u;
+const VIEW_POSE_V: u32 = 24u;
+const VIEW_POSE_AGE: u32 = 30u;
+const VIEW_EXPOSURE_AGE: u32 = 31u;
+const VIEW_EXPOSURE_M: u32 = 32u;
+const VIEW_EXPOSURE_V: u32 = 38u;
+// cam_from_map as the last step used it: rotation by columns, translation.
+const VIEW_NOW: u32 = 44u;
+const VIEW_EMBEDDING_AGE: u32 = 56u;
+const VIEW_EMBEDDING: u32 = 64u;
+const VIEW_EMBEDDING_M: u32 = 128u;
+const VIEW_EMBEDDING_V: u32 = 192u;
+const VIEW_STRIDE: u32 = 256u;
+
+// The shared network (3R-GS): parameters, first moments, second moments, then what else is shared.
+const N_WIDTH: u32 = 64u;
+const NET_W1: u32 = 0u;
+const NET_B1: u32 = 4096u;
+const NET_W2: u32 = 4160u;
+const NET_B2: u32 = 8256u;
+const NET_W3: u32 = 8320u;
+const NET_B3: u32 = 8896u;
+const NET_SIZE: u32 = 8905u;
+const NET_AGE: u32 = 26715u;
+const LOG_FOCAL: u32 = 26716u;
+const LOG_FOCAL_M: u32 = 26717u;
+const LOG_FOCAL_V: u32 = 26718u;
+const LOG_FOCAL_AGE: u32 = 26719u;

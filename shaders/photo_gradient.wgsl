@@ -1,0 +1,126 @@
+// photo_gradient: rendering, photo, depth and the maps of SSIM -> gradient at every pixel, and sums of the losses.
+// After ssim_back. One thread per 4 pixels of a column. Equations: docs/GRADIENTS.md, loss.
+
+#import step
+#import camera
+#import ssim
+
+// Relative error of inverse depth at which the depth loss turns from square to linear.
+const HUBER_DELTA: f32 = 0.05;
+// A pixel that is mostly see-through has no depth to speak of.
+const MIN_ALPHA_FOR_DEPTH: f32 = 0.5;
+const MIN_WEIGHT_SUM: f32 = 1e-6;
+
+@group(0) @binding(0) var<uniform> step: Step;
+@group(0) @binding(1) var<storage, read> camera: Camera;
+@group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> depth_sum: array<f32>;
+// Photo as r, g, b, weight bytes; behind it depth and confidence as bits of f32, both 0 where there is none.
+@group(0) @binding(4) var<storage, read> wanted: array<u32>;
+@group(0) @binding(5) var<storage, read> blurred: array<vec4<f32>>;
+// By r, g, b and the depth sum.
+@group(0) @binding(6) var<storage, read_write> v_picture: array<vec4<f32>>;
+// What lies behind the first splat, seen through the gradient, less the transmittance's part.
+@group(0) @binding(7) var<storage, read_write> behind: array<f32>;
+// Three per group: L1 and depth loss before their weights; gradient of log gain; gradient of offset.
+@group(0) @binding(8) var<storage, read_write> loss_sums: array<vec4<f32>>;
+
+var<workgroup> sums: array<vec4<f32>, 192>;
+
+struct Depth {
+    loss: f32,
+    v_depth: f32,
+}
+
+fn depth_loss(x: u32, y: u32, alpha: f32, z: f32, weight: f32) -> Depth {
+    let map_x = (2u * x + 1u) * step.depth_width / (2u * step.width_px);
+    let map_y = (2u * y + 1u) * step.depth_height / (2u * step.height_px);
+    let at = step.width_px * step.height_px + 2u * (map_y * step.depth_width + map_x);
+    let depth = bitcast<f32>(wanted[at]);
+    let confidence = bitcast<f32>(wanted[at + 1u]) * weight;
+    if confidence <= 0.0 || alpha <= MIN_ALPHA_FOR_DEPTH {
+        return Depth(0.0, 0.0);
+    }
+    let error = depth / z - 1.0;
+    let is_square = abs(error) <= HUBER_DELTA;
+    let huber = select(abs(error) - 0.5 * HUBER_DELTA, 0.5 * error * error / HUBER_DELTA, is_square);
+    let slope = select(sign(error), error / HUBER_DELTA, is_square);
+    let scale = confidence / max(step.confidence_sum, MIN_WEIGHT_SUM);
+    return Depth(scale * huber, -step.depth_weight * scale * slope * depth / (z * z));
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let thread = flat(group, groups) * 64u + lane;
+    let x = thread % step.width_px;
+    let first = i32(thread / step.width_px * RUN);
+    let plane = step.width_px * step.height_px;
+    let has_depth = (step.flags & FLAG_DEPTH) != 0u;
+    let per_weight = 1.0 / max(3.0 * step.mask_sum, MIN_WEIGHT_SUM);
+    var losses = vec4<f32>(0.0);
+    var by_gain = vec3<f32>(0.0);
+    var by_offset = vec3<f32>(0.0);
+#repeat t 14
+    var p_$t = vec3<f32>(0.0);
+    var q_$t = vec3<f32>(0.0);
+    var r_$t = vec3<f32>(0.0);
+    {
+        let y = first + $t - REACH;
+        if y >= 0 && y < i32(step.height_px) {
+            let at = u32(y) * step.width_px + x;
+            p_$t = blurred[at].xyz;
+            q_$t = blurred[plane + at].xyz;
+            r_$t = blurred[2u * plane + at].xyz;
+        }
+    }
+#end
+#repeat j 4
+    if first + $j < i32(step.height_px) {
+        var p = vec3<f32>(0.0);
+        var q = vec3<f32>(0.0);
+        var r = vec3<f32>(0.0);
+#repeat t 11
+        p += WINDOW[$t] * p_$[j+t];
+        q += WINDOW[$t] * q_$[j+t];
+        r += WINDOW[$t] * r_$[j+t];
+#end
+        let y = u32(first + $j);
+        let at = y * step.width_px + x;
+        let light = picture[at];
+        let photo = unpack4x8unorm(wanted[at]);
+        let seen = camera.gain.xyz * light.xyz;
+        let compared = seen + camera.offset.xyz;
+        let difference = compared - photo.xyz;
+        let by_ssim = p + 2.0 * compared * q + photo.xyz * r;
+        let v = per_weight * ((1.0 - step.ssim_weight) * photo.w * sign(difference) - step.ssim_weight * by_ssim);
+        losses.x += photo.w * dot(abs(difference), vec3<f32>(1.0)) * per_weight;
+        by_gain += v * seen;
+        by_offset += v;
+        let v_rgb = v * camera.gain.xyz;
+        var v_z = 0.0;
+        var v_alpha = 0.0;
+        let alpha = 1.0 - light.w;
+        let z_sum = depth_sum[at];
+        if has_depth && alpha > 0.0 {
+            let z = z_sum / alpha;
+            let depth = depth_loss(x, y, alpha, z, photo.w);
+            losses.y += depth.loss;
+            v_z = depth.v_depth / alpha;
+            v_alpha = -v_z * z;
+        }
+        v_picture[at] = vec4<f32>(v_rgb, v_z);
+        behind[at] = dot(light.xyz, v_rgb) + z_sum * v_z - light.w * v_alpha;
+    }
+#end
+    sums[lane] = losses;
+    sums[64u + lane] = vec4<f32>(by_gain, 0.0);
+    sums[128u + lane] = vec4<f32>(by_offset, 0.0);
+    workgroupBarrier();
+    if lane < 3u {
+        var total = vec4<f32>(0.0);
+        for (var other = 0u; other < 64u; other += 1u) {
+            total += sums[64u * lane + other];
+        }
+        loss_sums[3u * flat(group, groups) + lane] = total;
+    }
+}

@@ -1,0 +1,149 @@
+//! Poses that have drifted together, or jumped alone -> poses that stay by what the model gave.
+//!
+//! Pictures do not tell where the map frame is: a motion of all cameras and splats together changes none of them,
+//! so optimisers wander along it. And they tell little about a view that is badly wrong: one that has jumped goes
+//! back to the model's pose.
+
+use glam::DVec3;
+
+use crate::config::PoseRefinement;
+use crate::map::SplatMap;
+use crate::map::align::{self, Carry};
+use crate::map::keyframes::Placed;
+use crate::pose::{Rigid, Similarity};
+use crate::splat::RefinerSettings;
+
+/// Steps between looks at the poses.
+pub(super) const GAUGE_EVERY: u64 = 250;
+/// Common motion that is left alone, in radians and as a share of the spread of the cameras: moving all poses back
+/// makes their optimisers start again, which costs more.
+const MIN_DRIFT: f64 = 1e-3;
+/// A view that has left the model's pose by more has jumped (3R-GS poses stay within a fraction of it).
+const MAX_TURN_RAD: f64 = 5.0 * std::f64::consts::PI / 180.0;
+/// The same for its place, as a share of the spread of the cameras.
+const MAX_SHIFT: f64 = 0.1;
+/// The network starts again when the cameras have spread by this factor: its outputs would have become too small.
+const RESTART_GROWTH: f64 = 2.0;
+/// Least spread of the cameras as a share of the scene's depth, for a single place.
+const MIN_SPREAD: f64 = 0.05;
+
+/// Where the map frame lies by the model, and how far the cameras spread.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Gauge {
+    map_from_model: Similarity,
+    /// RMS distance of the cameras to their mean when the network was started.
+    network_scale: f64,
+}
+
+impl SplatMap {
+    /// After views were placed: remembers where the map lies, and starts the network where it is due.
+    pub(super) fn set_gauge(&mut self) {
+        let map_poses = self.engine.poses();
+        let map_from_model = self.map_from_model(&map_poses);
+        let spread = self.spread(&map_poses);
+        let old = self.gauge.map_or(0.0, |gauge| gauge.network_scale);
+        let is_due = spread > RESTART_GROWTH * old;
+        if is_due && self.params.pose == PoseRefinement::Shared {
+            self.engine.start_refiner(&RefinerSettings {
+                seed: self.seed,
+                camera_scale: spread as f32,
+            });
+        }
+        self.gauge = Some(Gauge {
+            map_from_model,
+            network_scale: if is_due { spread } else { old },
+        });
+    }
+
+    /// Moves all cameras and splats back by what they have moved together, and views that have jumped alone.
+    pub(super) fn hold_gauge(&mut self) {
+        let Some(gauge) = self.gauge else { return };
+        let mut map_poses = self.engine.poses();
+        let spread = self.spread(&map_poses);
+        let back = self.back_to(&gauge.map_from_model, &map_poses);
+        let shift = back.transform_point(self.centre(&map_poses)) - self.centre(&map_poses);
+        let drift = (shift.length() / spread).max(back.angle_to(&Rigid::IDENTITY));
+        if drift > MIN_DRIFT && back.is_finite() {
+            for (ix, pose) in map_poses.iter_mut().enumerate() {
+                *pose = (*pose * back.inverse()).renormalized();
+                self.engine.set_pose(ix, *pose);
+            }
+            let mut splats = self.engine.splats();
+            let carry = Carry::new(back, splats.sh_degree);
+            (0..splats.len()).for_each(|i| carry.carry(&mut splats, i));
+            self.engine.overwrite(&splats);
+        }
+        self.put_back_jumps(&map_poses, spread);
+    }
+
+    /// Views put back because they had jumped.
+    pub fn n_put_back(&self) -> u64 {
+        self.n_put_back
+    }
+
+    fn put_back_jumps(&mut self, map_poses: &[Rigid], spread: f64) {
+        let map_from_model = self.map_from_model(map_poses);
+        for (id, placed) in &self.keyframes.placed {
+            let wanted = map_from_model
+                .transform_pose(&placed.model_from_cam)
+                .inverse();
+            let found = &map_poses[placed.view_ix];
+            let shift = (wanted.inverse().translation - found.inverse().translation).length();
+            let turn = wanted.angle_to(found);
+            if found.is_finite() && turn <= MAX_TURN_RAD && shift <= MAX_SHIFT * spread {
+                continue;
+            }
+            self.engine.set_pose(placed.view_ix, wanted);
+            self.n_put_back += 1;
+            tracing::debug!(
+                "keyframe {id} is put back: {:.1} deg and {:.3} of the spread of the cameras off",
+                turn.to_degrees(),
+                shift / spread
+            );
+            if self.n_put_back == 1 {
+                tracing::warn!("keyframe {id} left the model's pose and is put back; said once");
+            }
+        }
+    }
+
+    /// The rigid motion of the map that takes the cameras' common place and heading to where the gauge has them.
+    fn back_to(&self, wanted: &Similarity, map_poses: &[Rigid]) -> Rigid {
+        let found = self.map_from_model(map_poses);
+        let rotation = (wanted.rotation * found.rotation.conjugate()).normalize();
+        let centre = self.centre(map_poses);
+        let in_model = found.inverse().transform_point(centre);
+        Rigid::new(
+            rotation,
+            wanted.transform_point(in_model) - rotation * centre,
+        )
+    }
+
+    /// Views that take part in optimisation: the others stay where they were put.
+    fn anchored(&self) -> impl Iterator<Item = &Placed> {
+        self.keyframes.placed.values().filter(|p| !p.is_held_out)
+    }
+
+    fn centre(&self, map_poses: &[Rigid]) -> DVec3 {
+        let n = self.anchored().count().max(1) as f64;
+        let centres = self
+            .anchored()
+            .map(|p| map_poses[p.view_ix].inverse().translation);
+        centres.sum::<DVec3>() / n
+    }
+
+    /// RMS distance of the cameras to their mean.
+    fn spread(&self, map_poses: &[Rigid]) -> f64 {
+        let n = self.anchored().count().max(1) as f64;
+        let centre = self.centre(map_poses);
+        let squares = self
+            .anchored()
+            .map(|p| (map_poses[p.view_ix].inverse().translation - centre).length_squared());
+        let spread = (squares.sum::<f64>() / n).sqrt();
+        spread.max(MIN_SPREAD * f64::from(self.scene_depth))
+    }
+
+    /// From the poses that the model gave to where the same cameras stand; `map_poses` by view index.
+    pub(super) fn map_from_model(&self, map_poses: &[Rigid]) -> Similarity {
+        align::align(&self.keyframes.pose_pairs(map_poses)).unwrap_or(Similarity::IDENTITY)
+    }
+}

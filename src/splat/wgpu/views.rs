@@ -1,0 +1,359 @@
+//! The views on the GPU: a record of pose, camera and exposure each, the picture that is wanted, and the shared network.
+
+use std::sync::Arc;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::camera::Intrinsics;
+use crate::frame::DepthMap;
+use crate::gpu::GpuError;
+use crate::gpu::buffer::Buffer;
+use crate::gpu::commands::Commands;
+use crate::gpu::device::Gpu;
+use crate::gpu::types::{
+    LOG_FOCAL, NET_FLOATS, NET_SIZE, VIEW_EMBEDDING, VIEW_EMBEDDING_AGE, VIEW_EXPOSURE,
+    VIEW_PINHOLE, VIEW_POSE_AGE, VIEW_POSE_M, VIEW_QUAT, VIEW_STRIDE, VIEW_TRANSLATION,
+};
+use crate::pose::Rigid;
+use crate::splat::refiner::{Embedding, Refiner, WIDTH};
+use crate::splat::{Match, RefinerSettings, TrainingView};
+
+const MIN_VIEWS: usize = 64;
+const N_POSE: usize = 6;
+
+#[derive(Debug)]
+pub(super) struct Views {
+    pub(super) all: Vec<View>,
+    /// `VIEW_STRIDE` floats a view.
+    pub(super) records: Buffer,
+    capacity: usize,
+    /// Parameters, moments, and what else all views share.
+    pub(super) network: Buffer,
+    /// Settings of the network once it has started.
+    pub(super) refiner: Option<RefinerSettings>,
+}
+
+/// What the host has to know of a view.
+#[derive(Debug)]
+pub(super) struct View {
+    /// Its `cam_from_map` is the base pose that was last written, in full precision.
+    pub(super) training: TrainingView,
+    /// Photo with pixel weights, then depth with confidence.
+    pub(super) wanted: Buffer,
+    pub(super) mask_sum: f32,
+    pub(super) confidence_sum: f32,
+    pub(super) matches: Vec<Match>,
+}
+
+impl Views {
+    pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        Ok(Self {
+            all: Vec::new(),
+            records: gpu.storage::<f32>("views", MIN_VIEWS * VIEW_STRIDE)?,
+            capacity: MIN_VIEWS,
+            network: gpu.storage::<f32>("network", NET_FLOATS)?,
+            refiner: None,
+        })
+    }
+
+    pub(super) fn add(&mut self, gpu: &Gpu, training: TrainingView) -> Result<usize, GpuError> {
+        if self.all.len() == self.capacity {
+            let capacity = 2 * self.capacity;
+            let grown = gpu.storage::<f32>("views", capacity * VIEW_STRIDE)?;
+            let mut commands = Commands::new(gpu);
+            commands.copy(&self.records, &grown, self.records.n_bytes());
+            commands.submit();
+            gpu.forget_bindings();
+            (self.records, self.capacity) = (grown, capacity);
+        }
+        let view = View::new(gpu, training)?;
+        let ix = self.all.len();
+        let pose = view.training.cam_from_map;
+        self.write_camera(gpu, ix, &view.training.intrinsics);
+        self.all.push(view);
+        self.set_pose(gpu, ix, pose)?;
+        Ok(ix)
+    }
+
+    pub(super) fn write_camera(&self, gpu: &Gpu, ix: usize, intrinsics: &Intrinsics) {
+        let i = intrinsics;
+        let pinhole = [i.fx, i.fy, i.cx, i.cy].map(|v| v as f32);
+        gpu.write(&self.records, ix * VIEW_STRIDE + VIEW_PINHOLE, &pinhole);
+    }
+
+    /// Moves the base so that base and network together are `cam_from_map`; the view's own optimiser starts again.
+    pub(super) fn set_pose(
+        &mut self,
+        gpu: &Gpu,
+        ix: usize,
+        cam_from_map: Rigid,
+    ) -> Result<(), GpuError> {
+        let base = match self.network(gpu)? {
+            None => cam_from_map,
+            Some(refiner) => {
+                let at = ix * VIEW_STRIDE + VIEW_EMBEDDING;
+                let embedding = embedding_of(&gpu.read(&self.records, at..at + WIDTH)?);
+                let output = refiner.forward(&embedding).output;
+                (refiner.motion(&output) * cam_from_map).renormalized()
+            }
+        };
+        self.write_base(gpu, ix, &base);
+        let record = ix * VIEW_STRIDE;
+        gpu.write(&self.records, record + VIEW_POSE_M, &[0.0_f32; 2 * N_POSE]);
+        gpu.write(&self.records, record + VIEW_POSE_AGE, &[0.0_f32]);
+        let moments = record + VIEW_EMBEDDING + WIDTH;
+        gpu.write(&self.records, moments, &[0.0_f32; 2 * WIDTH]);
+        gpu.write(&self.records, record + VIEW_EMBEDDING_AGE, &[0.0_f32]);
+        Ok(())
+    }
+
+    /// Refined poses: base and network together.
+    pub(super) fn poses(&self, gpu: &Gpu) -> Result<Vec<Rigid>, GpuError> {
+        let records: Vec<f32> = gpu.read(&self.records, 0..self.all.len() * VIEW_STRIDE)?;
+        let refiner = self.network(gpu)?;
+        let pose = |(record, view): (&[f32], &View)| {
+            let written = &view.training.cam_from_map;
+            // What no step has moved is as exact as it was given.
+            let is_written = record[VIEW_QUAT..VIEW_QUAT + 7] == numbers_of(written);
+            let base = if is_written {
+                *written
+            } else {
+                base_of(record)
+            };
+            let embedding = embedding_of(&record[VIEW_EMBEDDING..][..WIDTH]);
+            refiner
+                .as_ref()
+                .map_or(base, |refiner| refiner.apply(&base, &embedding))
+        };
+        let records = records.chunks_exact(VIEW_STRIDE);
+        Ok(records.zip(&self.all).map(pose).collect())
+    }
+
+    /// What the old network did stays in the bases; a new one starts.
+    pub(super) fn start_refiner(
+        &mut self,
+        gpu: &Gpu,
+        settings: &RefinerSettings,
+    ) -> Result<(), GpuError> {
+        let poses = self.poses(gpu)?;
+        let mut parameters = Refiner::new(settings).parameters;
+        // Moments and age; the focal factor behind them stays.
+        parameters.resize(3 * NET_SIZE + 1, 0.0);
+        gpu.write(&self.network, 0, &parameters);
+        for (ix, pose) in poses.iter().enumerate() {
+            self.write_base(gpu, ix, pose);
+            let record = ix * VIEW_STRIDE;
+            gpu.write(
+                &self.records,
+                record + VIEW_EMBEDDING,
+                &[0.0_f32; 3 * WIDTH],
+            );
+            gpu.write(&self.records, record + VIEW_EMBEDDING_AGE, &[0.0_f32]);
+        }
+        self.refiner = Some(*settings);
+        Ok(())
+    }
+
+    pub(super) fn focal_factor(&self, gpu: &Gpu) -> Result<f64, GpuError> {
+        let log: Vec<f32> = gpu.read(&self.network, LOG_FOCAL..LOG_FOCAL + 1)?;
+        Ok(log.first().map_or(1.0, |log| f64::from(*log).exp()))
+    }
+
+    pub(super) fn exposures(&self, gpu: &Gpu) -> Result<Vec<[[f32; 3]; 2]>, GpuError> {
+        let records: Vec<f32> = gpu.read(&self.records, 0..self.all.len() * VIEW_STRIDE)?;
+        let exposure = |record: &[f32]| {
+            std::array::from_fn(|kind| {
+                std::array::from_fn(|channel| record[VIEW_EXPOSURE + 3 * kind + channel])
+            })
+        };
+        Ok(records.chunks_exact(VIEW_STRIDE).map(exposure).collect())
+    }
+
+    /// The network as it is, when it has started.
+    fn network(&self, gpu: &Gpu) -> Result<Option<Refiner>, GpuError> {
+        let Some(settings) = &self.refiner else {
+            return Ok(None);
+        };
+        let mut refiner = Refiner::new(settings);
+        refiner.parameters = gpu.read(&self.network, 0..NET_SIZE)?;
+        Ok(Some(refiner))
+    }
+
+    fn write_base(&mut self, gpu: &Gpu, ix: usize, base: &Rigid) {
+        self.all[ix].training.cam_from_map = *base;
+        gpu.write(
+            &self.records,
+            ix * VIEW_STRIDE + VIEW_QUAT,
+            &numbers_of(base),
+        );
+    }
+}
+
+impl View {
+    fn new(gpu: &Gpu, training: TrainingView) -> Result<Self, GpuError> {
+        let words = wanted(&training);
+        Ok(Self {
+            wanted: gpu.storage_of("wanted", &words)?,
+            mask_sum: mask_sum(&training),
+            confidence_sum: confidence_sum(&training),
+            matches: Vec::new(),
+            training,
+        })
+    }
+
+    /// After mask or depth has changed.
+    pub(super) fn upload(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        let words = wanted(&self.training);
+        if words.len() as u64 * 4 <= self.wanted.n_bytes() {
+            gpu.write(&self.wanted, 0, &words);
+        } else {
+            self.wanted = gpu.storage_of("wanted", &words)?;
+            gpu.forget_bindings();
+        }
+        self.mask_sum = mask_sum(&self.training);
+        self.confidence_sum = confidence_sum(&self.training);
+        Ok(())
+    }
+
+    /// Size of the depth map; none is 0 x 0.
+    pub(super) fn depth_size(&self) -> [u32; 2] {
+        match &self.training.depth {
+            Some(depth) if is_whole(depth) => [depth.width_px, depth.height_px],
+            _ => [0; 2],
+        }
+    }
+}
+
+fn is_whole(depth: &DepthMap) -> bool {
+    let n = depth.width_px as usize * depth.height_px as usize;
+    n > 0 && depth.depth.len() >= n && depth.confidence.len() >= n
+}
+
+fn wanted(view: &TrainingView) -> Vec<u32> {
+    let weights = view.mask.as_deref();
+    let pixels = view.image.pixels.chunks_exact(3).enumerate();
+    let mut words: Vec<u32> = pixels
+        .map(|(p, rgb)| {
+            let weight = weights.map_or(u8::MAX, |weights| weights[p]);
+            u32::from_le_bytes([rgb[0], rgb[1], rgb[2], weight])
+        })
+        .collect();
+    if let Some(depth) = view.depth.as_deref().filter(|depth| is_whole(depth)) {
+        let both = depth.depth.iter().zip(&depth.confidence);
+        words.extend(both.flat_map(|(depth, confidence)| {
+            let is_usable =
+                *depth > 0.0 && depth.is_finite() && *confidence > 0.0 && confidence.is_finite();
+            let pair = if is_usable {
+                [*depth, *confidence]
+            } else {
+                [0.0; 2]
+            };
+            pair.map(f32::to_bits)
+        }));
+    }
+    words
+}
+
+fn mask_sum(view: &TrainingView) -> f32 {
+    match &view.mask {
+        None => (view.image.pixels.len() / 3) as f32,
+        Some(mask) => {
+            let sum: u64 = mask.iter().map(|byte| u64::from(*byte)).sum();
+            (sum as f64 / 255.0) as f32
+        }
+    }
+}
+
+/// Over the pixels of the picture, each with the nearest pixel of the depth map.
+fn confidence_sum(view: &TrainingView) -> f32 {
+    let Some(depth) = view.depth.as_deref().filter(|depth| is_whole(depth)) else {
+        return 0.0;
+    };
+    let (width, height) = (view.image.width_px as usize, view.image.height_px as usize);
+    let (map_width, map_height) = (depth.width_px as usize, depth.height_px as usize);
+    let mut sum = 0.0;
+    for y in 0..height {
+        let row = (2 * y + 1) * map_height / (2 * height) * map_width;
+        for x in 0..width {
+            let at = row + (2 * x + 1) * map_width / (2 * width);
+            let (depth, confidence) = (depth.depth[at], depth.confidence[at]);
+            let is_usable =
+                depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
+            if is_usable {
+                let weight = view
+                    .mask
+                    .as_ref()
+                    .map_or(1.0, |mask| f64::from(mask[y * width + x]) / 255.0);
+                sum += weight * f64::from(confidence);
+            }
+        }
+    }
+    sum as f32
+}
+
+/// As a record has it: quaternion, translation.
+fn numbers_of(pose: &Rigid) -> [f32; 7] {
+    let (q, t) = (pose.rotation, pose.translation);
+    [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v as f32)
+}
+
+fn base_of(record: &[f32]) -> Rigid {
+    let at = |k: usize| f64::from(record[k]);
+    let rotation = DQuat::from_xyzw(
+        at(VIEW_QUAT + 1),
+        at(VIEW_QUAT + 2),
+        at(VIEW_QUAT + 3),
+        at(VIEW_QUAT),
+    );
+    let t = VIEW_TRANSLATION;
+    Rigid::new(
+        rotation.normalize(),
+        DVec3::new(at(t), at(t + 1), at(t + 2)),
+    )
+}
+
+fn embedding_of(numbers: &[f32]) -> Embedding {
+    std::array::from_fn(|i| numbers[i])
+}
+
+/// A camera for a picture that no step makes.
+pub(super) fn camera_of(
+    intrinsics: &Intrinsics,
+    cam_from_map: &Rigid,
+) -> crate::gpu::types::Camera {
+    let i = intrinsics;
+    let rotation: DMat3 = cam_from_map.rotation_matrix();
+    let column = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];
+    let (width, height) = (f64::from(i.width_px), f64::from(i.height_px));
+    let (beyond_x, beyond_y) = (0.15 * width / i.fx, 0.15 * height / i.fy);
+    let bounds = [
+        -(i.cx / i.fx + beyond_x),
+        -(i.cy / i.fy + beyond_y),
+        (width - i.cx) / i.fx + beyond_x,
+        (height - i.cy) / i.fy + beyond_y,
+    ];
+    crate::gpu::types::Camera {
+        rotation_x: column(rotation.x_axis),
+        rotation_y: column(rotation.y_axis),
+        rotation_z: column(rotation.z_axis),
+        translation: column(cam_from_map.translation),
+        center: column(cam_from_map.inverse().translation),
+        pinhole: [i.fx, i.fy, i.cx, i.cy].map(|v| v as f32),
+        slope_bounds: bounds.map(|v| v as f32),
+        gain: [1.0; 4],
+        ..crate::gpu::types::Camera::default()
+    }
+}
+
+/// The picture's own weights, replaced.
+pub(super) fn set_mask(
+    view: &mut View,
+    gpu: &Gpu,
+    mask: Option<Arc<[u8]>>,
+) -> Result<(), GpuError> {
+    let n_pixels = view.training.image.pixels.len() / 3;
+    let is_fit = mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
+    assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");
+    view.training.mask = mask;
+    view.upload(gpu)
+}
