@@ -1,5 +1,5 @@
 # The four lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint bench setup
+.PHONY: demo test lint bench ablation setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -22,6 +22,12 @@ lint:
 bench:
 	scripts/setup build
 	cargo bench --locked --profile release --bench stages
+
+# The table of what each component is worth, on fox (SPLAT_MAPPER_DATA) and a made-up room; docs/BENCHMARKS.md explains it.
+ablation:
+	scripts/setup build
+	cargo build --release --locked --bins --example ablation
+	target/release/examples/ablation
 
 setup:
 	scripts/setup all

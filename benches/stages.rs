@@ -18,7 +18,7 @@ use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
 use splat_mapper::splat::cpu::raster_backward::{InstanceGradients, raster_backward};
 use splat_mapper::splat::cpu::{CpuEngine, bin, loss, project, raster};
-use splat_mapper::splat::{Engine, Splats, StepSettings, TrainingView};
+use splat_mapper::splat::{Engine, PoseStep, Splats, StepSettings, TrainingView};
 
 const WIDTH_PX: u32 = 270;
 const HEIGHT_PX: u32 = 480;
@@ -54,6 +54,8 @@ fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingVie
     let target = loss::Target {
         image: &view.image,
         depth: view.depth.as_deref(),
+        mask: None,
+        exposure: [[0.0; 3]; 2],
     };
     let (mut projected, mut tiles, mut picture) = (
         project::Projected::default(),
@@ -130,7 +132,8 @@ fn settings() -> StepSettings {
         scale_reg: 0.01,
         sh_degree: 3,
         train_splats: true,
-        train_pose: true,
+        pose: PoseStep::Direct,
+        ..StepSettings::default()
     }
 }
 
@@ -185,6 +188,7 @@ fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
         },
         cam_from_map: Rigid::new(DQuat::IDENTITY, DVec3::ZERO),
         depth: Some(Arc::new(depth)),
+        mask: None,
     };
     (splats, view)
 }

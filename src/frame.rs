@@ -65,6 +65,16 @@ pub struct DepthMap {
 }
 
 impl DepthMap {
+    /// No pixels at all.
+    pub fn none() -> Self {
+        Self {
+            width_px: 0,
+            height_px: 0,
+            depth: Vec::new(),
+            confidence: Vec::new(),
+        }
+    }
+
     /// Median of the verified depths; `None` where there are none.
     pub fn median(&self) -> Option<f32> {
         let usable = self
@@ -100,6 +110,8 @@ pub struct Frame {
     pub truth: Option<Rigid>,
     /// Exact depth where the source has it (synthetic scenes and their recordings), at image size or smaller.
     pub truth_depth: Option<Arc<DepthMap>>,
+    /// The source keeps it for measuring quality: it gets a place in the map, but no optimiser step learns from it.
+    pub is_held_out: bool,
 }
 
 /// A frame that the map keeps. Ids count from 0 without gaps, in order of time.

@@ -9,6 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::{ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::config::{ConfigError, Settings};
+use crate::eval::lpips;
 use crate::node::pipeline::{self, Subscriber};
 use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
 use crate::source;
@@ -57,6 +58,9 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 
 fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
     let mut settings = Settings::shipped();
+    if let Some(preset) = &args.preset {
+        settings.merge_preset(preset).map_err(|e| usage(&e))?;
+    }
     if let Some(file) = &args.params {
         settings.merge_file(file)?;
     }
@@ -77,6 +81,8 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         run_dir::prepare(out)?;
     }
     run_dir::start_log(out, is_terminal)?;
+    // A network that cannot be used is better known before the work than after it.
+    let lpips = lpips::lpips(&params.eval.lpips_model)?;
     let source = source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
@@ -92,7 +98,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
     bar.finish_and_clear();
     let mut outcome = outcome?;
-    let summary = run_dir::finish(&mut outcome, settings, out, input)?;
+    let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;
     say(summary);
     linger(&mut outcome, params.publish.linger_secs, &stop);
     verdict(&outcome, input)
@@ -102,6 +108,12 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
 fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     if let Some(error) = &outcome.error {
         anyhow::bail!("{error}: {input}");
+    }
+    if !outcome.snapshot.poses.is_empty() && outcome.snapshot.splats.is_empty() {
+        anyhow::bail!(
+            "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
+            outcome.snapshot.poses.len()
+        );
     }
     if outcome.snapshot.poses.is_empty() {
         let counts = &outcome.counts;

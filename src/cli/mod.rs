@@ -38,6 +38,9 @@ enum Command {
 /// Parameters, as launch/params.yaml lists them.
 #[derive(Debug, Args)]
 struct ParamArgs {
+    /// Values for a purpose, launch/presets/NAME.yaml: paper; --params and --set go over them
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
     /// File in ROS 2 parameter form; any subset of launch/params.yaml
     #[arg(long, value_name = "FILE")]
     params: Option<PathBuf>,
@@ -48,7 +51,7 @@ struct ParamArgs {
 
 #[derive(Debug, Args)]
 struct RunArgs {
-    /// mcap:PATH, images:DIR or synthetic:SCENE
+    /// mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
     #[arg(long, value_name = "URI")]
     source: String,
     /// Run directory to write at the end
@@ -123,8 +126,8 @@ struct SynthArgs {
 struct EvalArgs {
     /// Run directory of a replay
     run_dir: PathBuf,
-    /// Reference poses, camera to world, TUM format
-    #[arg(long, value_name = "poses_tum.txt")]
+    /// Reference poses, camera to world: a TUM file, a folder with poses_tum.txt, a COLMAP scene or a transforms.json
+    #[arg(long, value_name = "FILE_OR_SCENE")]
     reference: PathBuf,
     /// Prints JSON
     #[arg(long)]

@@ -13,6 +13,9 @@ use serde_json::Value;
 
 use crate::config::range::{Range, ranges_of_comments};
 
+/// Named sets of values in `launch/presets`.
+const PRESETS: [(&str, &str); 1] = [("paper", include_str!("../../launch/presets/paper.yaml"))];
+
 /// The shipped `launch/params.yaml`.
 pub const PARAMS_YAML: &str = include_str!("../../launch/params.yaml");
 
@@ -33,6 +36,8 @@ pub enum ConfigError {
         found: String,
         expected: String,
     },
+    #[error("{found:?} is no preset, expected {known}")]
+    Preset { found: String, known: String },
     #[error("{found:?} is no setting, expected key=value, for example map.steps=500")]
     Setting { found: String },
     #[error(
@@ -54,6 +59,7 @@ pub struct Params {
     pub sfm: SfmParams,
     pub mvs: MvsParams,
     pub map: MapParams,
+    pub eval: EvalParams,
     pub publish: PublishParams,
 }
 
@@ -72,6 +78,9 @@ pub struct SourceParams {
     pub camera_info_topic: String,
     pub pose_topic: String,
     pub depth_topic: String,
+    pub names: String,
+    pub held_out_names: String,
+    pub pick: usize,
     pub max_side: u32,
     pub max_frames: u64,
     pub rectify: bool,
@@ -96,6 +105,11 @@ pub struct SelectParams {
 pub struct KnownParams {
     pub rotation_noise_deg: f64,
     pub translation_noise: f64,
+    pub translation_noise_extent: f64,
+    pub drift_deg: f64,
+    pub drift_extent: f64,
+    pub offset_deg: f64,
+    pub offset_extent: f64,
     pub depth_noise: f64,
 }
 
@@ -119,6 +133,22 @@ pub struct MvsParams {
     pub min_views: usize,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PoseRefinement {
+    Direct,
+    Shared,
+    Held,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DepthLoss {
+    InvDepth,
+    PaperCode,
+    PaperAlpha,
+}
+
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MapParams {
@@ -131,6 +161,14 @@ pub struct MapParams {
     pub holdout: u32,
     pub ssim_weight: f32,
     pub depth_weight: f32,
+    pub depth_mode: DepthLoss,
+    pub epipolar_weight: f32,
+    pub transient: f32,
+    pub mcmc: bool,
+    pub mcmc_every: u64,
+    pub mcmc_start: u64,
+    pub growth: f32,
+    pub noise: f32,
     pub opacity_reg: f32,
     pub scale_reg: f32,
     pub min_opacity: f32,
@@ -139,9 +177,20 @@ pub struct MapParams {
     pub lr_quat: f32,
     pub lr_opacity: f32,
     pub lr_sh: f32,
+    pub sh_interval: u32,
+    pub pose: PoseRefinement,
     pub lr_rotation: f32,
     pub lr_translation: f32,
+    pub lr_refiner: f32,
+    pub lr_focal: f32,
+    pub lr_exposure: f32,
     pub snapshot_secs: f64,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvalParams {
+    pub lpips_model: String,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -188,13 +237,28 @@ impl Settings {
         Self { values, ranges }
     }
 
+    /// Applies one of the shipped presets over what is there.
+    pub fn merge_preset(&mut self, name: &str) -> Result<(), ConfigError> {
+        let preset = PRESETS.iter().find(|(known, _)| *known == name);
+        let (_, text) = preset.ok_or_else(|| ConfigError::Preset {
+            found: name.to_owned(),
+            known: PRESETS.map(|(known, _)| known).join(", "),
+        })?;
+        self.merge_text(text, &PathBuf::from(name))
+    }
+
     /// Applies a user's parameter file over what is there.
     pub fn merge_file(&mut self, path: &Path) -> Result<(), ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|e| ConfigError::Read {
             reason: e.to_string(),
             path: path.to_owned(),
         })?;
-        let tree = parse_file(&text).map_err(|reason| ConfigError::Form {
+        self.merge_text(&text, path)
+    }
+
+    /// `path` is for the error only.
+    fn merge_text(&mut self, text: &str, path: &Path) -> Result<(), ConfigError> {
+        let tree = parse_file(text).map_err(|reason| ConfigError::Form {
             reason,
             path: path.to_owned(),
         })?;

@@ -59,3 +59,27 @@ fn a_whole_number_is_fine_where_a_fraction_may_stand() {
     let params = settings.params().unwrap();
     assert_eq!((params.select.min_flow, params.map.steps), (1.0, 500));
 }
+
+#[test]
+fn every_preset_is_shipped_and_names_known_keys() {
+    for entry in std::fs::read_dir("launch/presets").unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        Settings::shipped().merge_preset(&name).unwrap();
+    }
+    let error = Settings::shipped().merge_preset("papr").unwrap_err();
+    assert_eq!(error.to_string(), "\"papr\" is no preset, expected paper");
+}
+
+#[test]
+fn settings_go_over_a_preset_and_a_preset_over_the_defaults() {
+    let mut settings = Settings::shipped();
+    let seed = settings.params().unwrap().seed;
+    settings.merge_preset("paper").unwrap();
+    settings.merge_setting("map.steps=70").unwrap();
+    let params = settings.params().unwrap();
+    assert_eq!(
+        (params.map.steps, params.map.sh_degree, params.seed),
+        (70, 3, seed)
+    );
+}

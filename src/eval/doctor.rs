@@ -5,6 +5,7 @@
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
+use super::lpips::ONNX_RUNTIME_FIX;
 use super::machine::{
     cpu_features, entries, find_library, free_disk_mib, free_memory_mib, icd_files, library_folders,
 };
@@ -269,7 +270,6 @@ fn cameras(dev: &Path) -> Check {
 }
 
 fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
-    const FIX: &str = "pip install onnxruntime, then export ORT_DYLIB_PATH=<site-packages>/onnxruntime/capi/libonnxruntime.so.<version>";
     if let Some(path) = named {
         return if path.is_file() {
             Check::ok("onnx runtime", path.display().to_string())
@@ -277,7 +277,7 @@ fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
             Check::optional(
                 "onnx runtime",
                 format!("ORT_DYLIB_PATH names no file: {}", path.display()),
-                FIX,
+                ONNX_RUNTIME_FIX,
             )
         };
     }
@@ -285,8 +285,8 @@ fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
         Some(path) => Check::ok("onnx runtime", path.display().to_string()),
         None => Check::optional(
             "onnx runtime",
-            "none; this version uses --geometry sfm, a later one onnx:FILE too",
-            FIX,
+            "none; only eval.lpips_model needs it (and onnx:FILE geometry in a later version)",
+            ONNX_RUNTIME_FIX,
         ),
     }
 }

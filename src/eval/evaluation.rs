@@ -9,11 +9,13 @@ use serde::Serialize;
 
 use super::EvalError;
 use super::align::{AlignError, align};
+use super::figures::ordinal;
 use super::report::{Quality, Report};
 use super::trajectory::{
     TOLERANCE_SECS, TimedPose, associate, read_tum, shifted, stamp_offset_nanos,
 };
-use crate::pose::Rigid;
+use crate::pose::{Rigid, extent};
+use crate::source::scene_formats::{Layout, SceneView};
 
 /// What `eval --json` prints. A figure that has no value is null and `note` says why.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -42,11 +44,12 @@ pub struct Evaluation {
     pub quality: Option<Quality>,
 }
 
-/// Compares `RUN_DIR/keyframes.tum` with a reference in TUM form.
+/// Compares `RUN_DIR/keyframes.tum` with a reference: a TUM file, or a scene that `source::scene_formats` knows, whose
+/// stamps are those that a replay of it gives its frames.
 pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalError> {
     let keyframes_path = run_dir.join("keyframes.tum");
     let keyframes = read_poses(&keyframes_path)?;
-    let truth = read_poses(reference)?;
+    let truth = read_reference(reference)?;
     let report_path = run_dir.join("report.json");
     let quality = if report_path.exists() {
         Some(Report::read(&report_path)?.quality)
@@ -146,40 +149,6 @@ fn join_notes(first: Option<String>, second: Option<String>) -> Option<String> {
     (!notes.is_empty()).then(|| notes.join("; "))
 }
 
-/// The largest distance between two points. Exact up to some thousand points; beyond, at most 0.5 % too small.
-pub fn extent(points: &[DVec3]) -> f64 {
-    const MAX_EXACT: usize = 4000;
-    const N_DIRECTIONS: usize = 512;
-
-    let longest = |points: &[DVec3]| {
-        let pairs = points
-            .iter()
-            .enumerate()
-            .flat_map(|(ix, a)| points[ix + 1..].iter().map(move |b| a.distance_squared(*b)));
-        pairs.fold(0.0, f64::max).sqrt()
-    };
-    if points.len() <= MAX_EXACT {
-        return longest(points);
-    }
-    // The two ends of the longest distance are nearly outermost along one of many even directions: no direction
-    // is further than 0.1 rad from a spiral point of the half sphere, and cos(0.1) = 0.995.
-    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-    let outermost: Vec<DVec3> = (0..N_DIRECTIONS)
-        .flat_map(|ix| {
-            let z = (ix as f64 + 0.5) / N_DIRECTIONS as f64;
-            let (sin, cos) = (golden_angle * ix as f64).sin_cos();
-            let radius = (1.0 - z * z).sqrt();
-            let direction = DVec3::new(radius * cos, radius * sin, z);
-            let along = |a: &&DVec3, b: &&DVec3| a.dot(direction).total_cmp(&b.dot(direction));
-            [points.iter().min_by(along), points.iter().max_by(along)]
-                .into_iter()
-                .flatten()
-                .copied()
-        })
-        .collect();
-    longest(&outermost)
-}
-
 /// For people: one figure a line.
 impl std::fmt::Display for Evaluation {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -213,13 +182,17 @@ impl std::fmt::Display for Evaluation {
             figure(self.aligned_scale)
         )?;
         if let Some(quality) = &self.quality {
-            if quality.holdout_every > 0 {
+            if quality.holdout_every > 0 || quality.psnr_holdout.is_some() {
+                let which = match quality.holdout_every {
+                    0 => "named by the source".to_owned(),
+                    n => format!("every {} keyframe", ordinal(n)),
+                };
                 writeln!(
                     f,
-                    "held-out views   PSNR {} dB, SSIM {} (every {}th keyframe)",
+                    "held-out views   PSNR {} dB, SSIM {}, LPIPS {} ({which})",
                     figure(quality.psnr_holdout),
                     figure(quality.ssim_holdout),
-                    quality.holdout_every
+                    figure(quality.lpips_holdout),
                 )?;
             }
             writeln!(f, "training views   PSNR {} dB", figure(quality.psnr_train))?;
@@ -229,6 +202,23 @@ impl std::fmt::Display for Evaluation {
         }
         Ok(())
     }
+}
+
+fn read_reference(path: &Path) -> Result<Vec<TimedPose>, EvalError> {
+    let beside_pictures = path.join("poses_tum.txt");
+    if beside_pictures.is_file() {
+        return read_poses(&beside_pictures);
+    }
+    let Some(layout) = Layout::find(path) else {
+        return read_poses(path);
+    };
+    // Sizes of pictures do not matter here.
+    let views = layout.views(u32::MAX)?;
+    let timed = |view: &SceneView| TimedPose {
+        stamp: view.stamp,
+        pose: view.world_from_cam,
+    };
+    Ok(views.iter().map(timed).collect())
 }
 
 fn read_poses(path: &Path) -> Result<Vec<TimedPose>, EvalError> {

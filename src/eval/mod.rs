@@ -10,6 +10,7 @@ pub mod evaluation;
 pub mod figures;
 pub mod html;
 pub mod image_metrics;
+pub mod lpips;
 pub mod machine;
 pub mod pictures;
 pub mod render;
@@ -50,6 +51,8 @@ pub enum EvalError {
         tolerance_secs: f64,
         path: PathBuf,
     },
+    #[error(transparent)]
+    Scene(#[from] crate::source::SourceError),
     #[error("intrinsics: {problem}, found {found}; expected a pinhole with width, height, fx, fy, cx, cy in pixels: {}", path.display())]
     Intrinsics {
         problem: &'static str,

@@ -93,7 +93,7 @@ pub struct Quality {
     pub psnr_train: Option<f64>,
     pub psnr_holdout: Option<f64>,
     pub ssim_holdout: Option<f64>,
-    /// Needs a trained network, so mostly null.
+    /// By the network of `eval.lpips_model`; null without one.
     pub lpips_holdout: Option<f64>,
 }
 

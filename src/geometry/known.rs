@@ -1,93 +1,213 @@
-//! Geometry from the recording's own truth, with stated noise: runs the whole node without estimating anything.
+//! Geometry from the recording's own truth, with stated noise: runs the whole node without estimating a pose.
+//!
+//! Depth is the recording's where it has some, else stereo at the true poses, for which frames that the source holds
+//! out are not used: what measures quality must not shape the map. Poses and depth are disturbed after
+//! that, each by its own noise: depth that rested on poses 1 deg off would be none at all, as neighbouring pictures
+//! would lie several pixels beside the lines on which stereo looks for them.
+
+use std::collections::BTreeMap;
 
 use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::config::KnownParams;
+use crate::config::{KnownParams, MvsParams, SfmParams};
 use crate::frame::{Batch, DepthMap, Keyframe};
-use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, Health, View};
+use crate::geometry::sfm::posed::PosedStereo;
+use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, Health, PoseError, View};
 use crate::pose::Rigid;
 
-/// Answers with `Frame::truth` and `Frame::truth_depth`. The batch frame is the recording's map frame, in its unit.
+/// Drift is stated per so many keyframes.
+const DRIFT_KEYFRAMES: f64 = 100.0;
+/// Added to the seed for the direction of the drift, which is one for all keyframes.
+const DRIFT_STREAM: u64 = 0x5eed_d41f;
+
+/// Answers with `Frame::truth`, and with `Frame::truth_depth` or stereo. The batch frame is the recording's map frame,
+/// in its unit.
 #[derive(Debug)]
 pub struct Known {
     params: KnownParams,
     seed: u64,
+    /// Largest distance between two true positions: the unit of `*_extent`.
+    extent: f64,
+    stereo: PosedStereo,
+    /// By keyframe id: the pose that was given out, and the generator as drawing it left it. A shared keyframe gets
+    /// the same noise in every batch, even when its depth and so its median changes.
+    disturbed: BTreeMap<u32, (Rigid, Pcg64Mcg)>,
 }
 
 impl Known {
-    pub fn new(params: KnownParams, seed: u64) -> Self {
-        Self { params, seed }
+    pub fn new(
+        params: KnownParams,
+        (sfm, mvs): (&SfmParams, &MvsParams),
+        extent: Option<f64>,
+        seed: u64,
+    ) -> Result<Self, GeometryError> {
+        let shares = [
+            params.translation_noise_extent,
+            params.drift_extent,
+            params.offset_extent,
+        ];
+        let needs_extent = shares.iter().any(|share| *share > 0.0);
+        if needs_extent && extent.is_none() {
+            return Err(GeometryError::NoExtent);
+        }
+        Ok(Self {
+            params,
+            seed,
+            extent: extent.unwrap_or(0.0),
+            stereo: PosedStereo::new(sfm, mvs, seed),
+            disturbed: BTreeMap::new(),
+        })
     }
 
-    fn view(&self, keyframe: &Keyframe) -> Result<View, GeometryError> {
-        let missing = |needs| GeometryError::Missing {
-            model: "known",
-            needs,
-            keyframe_id: keyframe.id,
-            way_out: "use --geometry sfm",
-        };
-        let frame = &keyframe.frame;
-        let truth = frame
-            .truth
-            .ok_or_else(|| missing("a ground truth pose (PoseStamped or tf)"))?;
-        let intrinsics = frame.intrinsics.ok_or_else(|| missing("a CameraInfo"))?;
-        let depth = frame
-            .truth_depth
-            .as_ref()
-            .ok_or_else(|| missing("a depth picture of equal stamp"))?;
-        // One stream of numbers per keyframe: a shared keyframe gets the same noise in every batch.
-        let mut rng = Pcg64Mcg::seed_from_u64(self.seed ^ (u64::from(keyframe.id) << 20));
+    /// Views that need no stereo: with the exact depth of their recording, or held out and without any.
+    fn views_without_stereo(&mut self, batch: &Batch) -> Result<Vec<View>, GeometryError> {
+        let mut views = Vec::new();
+        for keyframe in &batch.keyframes {
+            let held_out = keyframe.frame.is_held_out.then(DepthMap::none);
+            let exact = keyframe.frame.truth_depth.as_deref().cloned();
+            if let Some(depth) = exact.or(held_out) {
+                let view = View {
+                    keyframe_id: keyframe.id,
+                    component: 0,
+                    intrinsics: keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?,
+                    batch_from_cam: truth_of(keyframe)?,
+                    depth,
+                    health: Health::default(),
+                };
+                views.push(self.disturb(view));
+            }
+        }
+        Ok(views)
+    }
+
+    /// Views with depth by stereo, of this batch and revised ones of earlier batches.
+    fn views_by_stereo(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
+        let mut poses = BTreeMap::new();
+        for keyframe in &batch.keyframes {
+            keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?;
+            if !keyframe.frame.is_held_out {
+                poses.insert(keyframe.id, truth_of(keyframe)?);
+            }
+        }
+        Ok(self.stereo.infer(batch, &poses))
+    }
+
+    /// The view where the noise puts it, and its depth as the noise leaves it.
+    fn disturb(&mut self, mut view: View) -> View {
+        let id = view.keyframe_id;
+        if !self.disturbed.contains_key(&id) {
+            let fresh = self.disturbed_pose(id, view.batch_from_cam, &view.depth);
+            self.disturbed.insert(id, fresh);
+        }
+        let (pose, mut rng) = self.disturbed[&id].clone();
+        view.batch_from_cam = pose;
+        add_noise(&mut view.depth, self.params.depth_noise as f32, &mut rng);
+        view
+    }
+
+    fn disturbed_pose(&self, id: u32, truth: Rigid, depth: &DepthMap) -> (Rigid, Pcg64Mcg) {
+        let params = &self.params;
+        let mut rng = Pcg64Mcg::seed_from_u64(self.seed ^ (u64::from(id) << 20));
         let median = depth.median().map_or(1.0, f64::from);
-        let angle = self.params.rotation_noise_deg.to_radians();
-        let mut normal3 =
-            |std: f64| DVec3::new(normal(&mut rng), normal(&mut rng), normal(&mut rng)) * std;
-        let (theta, rho) = (
-            normal3(angle),
-            normal3(self.params.translation_noise * median),
-        );
-        let batch_from_cam = truth * Rigid::exp(rho, theta);
-        Ok(View {
-            keyframe_id: keyframe.id,
-            component: 0,
-            intrinsics,
-            batch_from_cam,
-            depth: noisy_depth(depth, self.params.depth_noise as f32, &mut rng),
-            health: Health::default(),
-        })
+        let theta = normal3(&mut rng) * params.rotation_noise_deg.to_radians();
+        let share = params.translation_noise * median;
+        let rho = normal3(&mut rng) * share.hypot(params.translation_noise_extent * self.extent);
+        (truth * Rigid::exp(rho, theta) * self.offset(id), rng)
+    }
+
+    /// What all keyframes have in common: a constant, and what grows from one to the next.
+    fn offset(&self, id: u32) -> Rigid {
+        let mut rng = Pcg64Mcg::seed_from_u64(self.seed ^ DRIFT_STREAM);
+        let mut direction = || normal3(&mut rng).normalize_or(DVec3::X);
+        let progress = f64::from(id) / DRIFT_KEYFRAMES;
+        let degrees = self.params.drift_deg * progress + self.params.offset_deg;
+        let theta = direction() * degrees.to_radians();
+        let share = self.params.drift_extent * progress + self.params.offset_extent;
+        let rho = direction() * share * self.extent;
+        Rigid::exp(rho, theta)
+    }
+
+    /// What the noise leaves poses unsure by.
+    fn pose_error(&self, views: &[View]) -> PoseError {
+        let params = &self.params;
+        let median = views.iter().find_map(|view| view.depth.median());
+        let share = params.translation_noise * median.map_or(0.0, f64::from);
+        let extents = params.translation_noise_extent.hypot(params.offset_extent);
+        PoseError {
+            rotation_rad: params
+                .rotation_noise_deg
+                .hypot(params.offset_deg)
+                .to_radians(),
+            translation: share.hypot(extents * self.extent),
+        }
     }
 }
 
 impl GeometryModel for Known {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
-        let views = batch
-            .keyframes
-            .iter()
-            .map(|keyframe| self.view(keyframe))
-            .collect::<Result<_, _>>()?;
-        Ok(GeometryBatch {
-            batch_id: batch.id,
-            views,
-            revised: Vec::new(),
-            note: None,
-        })
+        let ready = self.views_without_stereo(batch)?;
+        if ready.len() == batch.keyframes.len() {
+            return Ok(GeometryBatch {
+                batch_id: batch.id,
+                pose_error: self.pose_error(&ready),
+                views: ready,
+                ..GeometryBatch::default()
+            });
+        }
+        let mut answer = self.views_by_stereo(batch)?;
+        answer
+            .views
+            .retain(|view| ready.iter().all(|w| w.keyframe_id != view.keyframe_id));
+        let by_stereo = answer.views.into_iter().map(|view| self.disturb(view));
+        answer.views = by_stereo.chain(ready).collect();
+        answer.pose_error = self.pose_error(&answer.views);
+        Ok(answer)
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
-        Ok(GeometryBatch::default())
+        let mut answer = self.stereo.finish();
+        answer.views = answer.views.into_iter().map(|v| self.disturb(v)).collect();
+        answer.pose_error = self.pose_error(&answer.views);
+        Ok(answer)
     }
 }
 
-fn noisy_depth(depth: &DepthMap, std: f32, rng: &mut Pcg64Mcg) -> DepthMap {
-    let mut noisy = depth.clone();
+fn truth_of(keyframe: &Keyframe) -> Result<Rigid, GeometryError> {
+    let missing = || {
+        missing(
+            "a ground truth pose (PoseStamped, tf or a scene's)",
+            keyframe,
+        )
+    };
+    keyframe.frame.truth.ok_or_else(missing)
+}
+
+fn no_lens(keyframe: &Keyframe) -> GeometryError {
+    missing("a calibration (CameraInfo or intrinsics.json)", keyframe)
+}
+
+fn missing(needs: &'static str, keyframe: &Keyframe) -> GeometryError {
+    GeometryError::Missing {
+        model: "known",
+        needs,
+        keyframe_id: keyframe.id,
+        way_out: "use --geometry sfm",
+    }
+}
+
+fn add_noise(depth: &mut DepthMap, std: f32, rng: &mut Pcg64Mcg) {
     if std > 0.0 {
-        for value in &mut noisy.depth {
+        for value in &mut depth.depth {
             // A depth of zero means no value and stays so; noise never makes one negative.
             *value *= (1.0 + std * normal(rng) as f32).max(0.05);
         }
     }
-    noisy
+}
+
+fn normal3(rng: &mut Pcg64Mcg) -> DVec3 {
+    DVec3::new(normal(rng), normal(rng), normal(rng))
 }
 
 /// Standard normal (Box and Muller 1958).

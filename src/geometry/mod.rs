@@ -40,6 +40,31 @@ pub struct View {
     pub health: Health,
 }
 
+/// What a model has learned since of a keyframe that it placed in an earlier batch.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Revision {
+    pub keyframe_id: u32,
+    pub component: u32,
+    pub intrinsics: Intrinsics,
+    pub batch_from_cam: Rigid,
+}
+
+/// Standard deviation of poses that the model itself states; 0 where it states none and poses are taken for good.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PoseError {
+    pub rotation_rad: f64,
+    /// In the unit of the poses.
+    pub translation: f64,
+}
+
+/// Where a keyframe saw points that other keyframes saw too.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sightings {
+    pub keyframe_id: u32,
+    /// (number of the point, the same in all keyframes; pixel of the keyframe's picture).
+    pub landmarks: Vec<(u32, [f32; 2])>,
+}
+
 /// What a model says of one batch. Keyframes that cannot be placed are absent, never guessed; a model that keeps
 /// state may deliver them with a later batch, and may revise poses it gave before.
 #[derive(Debug, Clone, Default)]
@@ -47,8 +72,12 @@ pub struct GeometryBatch {
     pub batch_id: u32,
     /// Newly placed keyframes (of this batch or left over from earlier ones) and the shared ones again.
     pub views: Vec<View>,
-    /// Keyframes of earlier batches whose pose changed, in the same frame as `views`: (keyframe id, component, batch_from_cam).
-    pub revised: Vec<(u32, u32, Rigid)>,
+    /// Keyframes of earlier batches whose camera changed, in the same frame as `views`.
+    pub revised: Vec<Revision>,
+    /// How far off the poses of `views` may be.
+    pub pose_error: PoseError,
+    /// Of models that match points; empty from others.
+    pub sightings: Vec<Sightings>,
     /// Why keyframes are missing, one plain sentence, for status and errors.
     pub note: Option<String>,
 }
@@ -62,6 +91,10 @@ pub enum GeometryError {
         keyframe_id: u32,
         way_out: &'static str,
     },
+    #[error(
+        "known.translation_noise_extent and known.drift_extent are shares of the distance between the outermost true positions, which this source does not know beforehand; use known.translation_noise"
+    )]
+    NoExtent,
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
 }

@@ -17,6 +17,7 @@ use crate::config::{Backend, Params, PublishParams};
 use crate::geometry::GeometryModel;
 use crate::geometry::known::Known;
 use crate::geometry::sfm::Sfm;
+use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
 use crate::map::snapshot::{ScaleSource, Snapshot};
 use crate::node::pipeline::Subscriber;
@@ -24,6 +25,7 @@ use crate::pose::Rigid;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
 use crate::splat::cpu::CpuEngine;
+use crate::splat::wgpu::WgpuEngine;
 
 /// How often a lingering node looks for Ctrl-C.
 const LINGER_TICK: Duration = Duration::from_millis(50);
@@ -114,14 +116,22 @@ impl std::fmt::Debug for Outcome {
 }
 
 /// The geometry model that the parameters name, and where its lengths come from.
-fn model(params: &Params) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
+fn model(
+    params: &Params,
+    truth_extent: Option<f64>,
+) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
     match params.geometry.as_str() {
         "sfm" => Ok((
             Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)),
             ScaleSource::UpToScale,
         )),
         "known" => Ok((
-            Box::new(Known::new(params.known.clone(), params.seed)),
+            Box::new(Known::new(
+                params.known.clone(),
+                (&params.sfm, &params.mvs),
+                truth_extent,
+                params.seed,
+            )?),
             ScaleSource::Given,
         )),
         name if name.starts_with("onnx:") => {
@@ -133,9 +143,24 @@ fn model(params: &Params) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource
 
 /// The best engine that the parameters allow.
 pub fn engine(backend: Backend) -> anyhow::Result<Box<dyn Engine>> {
+    let wgpu = |any_kind| {
+        let wanted = Wanted {
+            any_kind,
+            subgroups: true,
+        };
+        WgpuEngine::new(wanted)
+    };
     match backend {
-        Backend::Auto | Backend::Cpu => Ok(Box::new(CpuEngine::new())),
-        Backend::Wgpu => bail!("this build has no wgpu backend; use --backend cpu or auto"),
+        Backend::Cpu => Ok(Box::new(CpuEngine::new())),
+        Backend::Wgpu => Ok(Box::new(wgpu(true)?)),
+        // Software Vulkan is slower than the native engine, so only hardware will do.
+        Backend::Auto => Ok(match wgpu(false) {
+            Ok(engine) => Box::new(engine),
+            Err(error) => {
+                tracing::info!("mapping on the CPU: {error}");
+                Box::new(CpuEngine::new())
+            }
+        }),
     }
 }
 

@@ -34,7 +34,7 @@ pub fn run(
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<Outcome> {
     let watch = Stopwatch::start();
-    let (model, scale) = model(&job.params)?;
+    let (model, scale) = model(&job.params, job.source.truth_extent())?;
     let n_frames = job.source.len_hint().filter(|n| *n > 0);
     let map = SplatMap::new(
         job.params.map.clone(),
@@ -185,6 +185,7 @@ impl Stages {
 
 impl End {
     fn into_outcome(self) -> Outcome {
+        let fault = self.map.map.fault().map(|fault| format!("engine: {fault}"));
         Outcome {
             snapshot: self.snapshot,
             counts: self.counts,
@@ -202,7 +203,7 @@ impl End {
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
             map: self.map.map,
             geometry_note: self.geometry.note,
-            error: self.error,
+            error: self.error.or(fault),
             subscriber: self.subscriber,
         }
     }

@@ -18,15 +18,18 @@ use crate::config::Settings;
 use crate::eval::comparisons::Comparison;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
+use crate::eval::lpips::{Lpips, LpipsError};
 use crate::eval::report::{
     FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib,
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
+use crate::frame::RgbImage;
 use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::layout::map_sha256;
 use crate::map::snapshot::Snapshot;
 use crate::node::Outcome;
+use crate::splat::Rendering;
 
 /// Training views whose quality is measured: enough for a mean, few enough for long recordings.
 const MAX_TRAIN_VIEWS: usize = 24;
@@ -85,12 +88,13 @@ pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
 pub fn finish(
     outcome: &mut Outcome,
     settings: &Settings,
+    lpips: Option<Lpips>,
     out: Option<&Path>,
     input: &str,
 ) -> anyhow::Result<String> {
     let params = settings.params()?;
     let (quality, comparisons) = match out {
-        Some(_) => measure_quality(outcome, params.map.holdout),
+        Some(_) => measure_quality(outcome, params.map.holdout, lpips),
         None => (Quality::default(), Vec::new()),
     };
     let report = report(outcome, settings, quality);
@@ -180,7 +184,10 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             &outcome.keyframe_to_snapshot_secs,
         ),
         peak_rss_mib: peak_rss_mib(),
-        peak_gpu_mib: None,
+        peak_gpu_mib: match outcome.map.peak_gpu_bytes() {
+            0 => None,
+            n_bytes => Some(n_bytes as f64 / (1 << 20) as f64),
+        },
         quality,
         scale: Scale::of(snapshot.scale),
         source_fault: outcome.counts.fault.clone(),
@@ -191,7 +198,11 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
 }
 
 /// PSNR over held-out and some training views, and the pictures for the report.
-fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<Comparison>) {
+fn measure_quality(
+    outcome: &mut Outcome,
+    holdout_every: u32,
+    mut lpips: Option<Lpips>,
+) -> (Quality, Vec<Comparison>) {
     let ids = outcome.map.keyframe_ids();
     let (held_out, train): (Vec<u32>, Vec<u32>) = {
         let (held_out, train): (Vec<_>, Vec<_>) =
@@ -206,7 +217,7 @@ fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<C
     let mut pictures = Vec::new();
     let mut measure = |ids: &[u32], is_held_out: bool, max_pictures: usize| {
         let picture_stride = ids.len().div_ceil(max_pictures).max(1);
-        let (mut psnrs, mut ssims) = (Vec::new(), Vec::new());
+        let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
         for (i, id) in ids.iter().enumerate() {
             let Some((rendering, photo)) = outcome.map.render_keyframe(*id) else {
                 continue;
@@ -214,6 +225,9 @@ fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<C
             let psnr = image_metrics::psnr(&rendering.rgb, &photo);
             psnrs.push(psnr);
             ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
+            if is_held_out {
+                distances.extend(lpips_of(&mut lpips, &rendering, &photo));
+            }
             if i % picture_stride == 0 {
                 pictures.push(Comparison {
                     keyframe_id: *id,
@@ -224,18 +238,33 @@ fn measure_quality(outcome: &mut Outcome, holdout_every: u32) -> (Quality, Vec<C
                 });
             }
         }
-        (mean(&psnrs), mean(&ssims))
+        // A mean over some of the views would be another figure.
+        let is_whole = distances.len() == psnrs.len();
+        let distance = mean(&distances).filter(|_| is_whole);
+        (mean(&psnrs), mean(&ssims), distance)
     };
-    let (psnr_holdout, ssim_holdout) = measure(&held_out, true, MAX_HELD_OUT_PICTURES);
-    let (psnr_train, _) = measure(&train, false, MAX_TRAIN_PICTURES);
+    let (psnr_holdout, ssim_holdout, lpips_holdout) =
+        measure(&held_out, true, MAX_HELD_OUT_PICTURES);
+    let (psnr_train, ..) = measure(&train, false, MAX_TRAIN_PICTURES);
     let quality = Quality {
         holdout_every: u64::from(holdout_every),
         psnr_train,
         psnr_holdout,
         ssim_holdout,
-        lpips_holdout: None,
+        lpips_holdout,
     };
     (quality, pictures)
+}
+
+/// A network that fails is not asked again: the run is worth more than this figure.
+fn lpips_of(lpips: &mut Option<Lpips>, rendering: &Rendering, photo: &RgbImage) -> Option<f64> {
+    let distance = lpips.as_mut()?.distance(&rendering.rgb, photo);
+    let failed = |e: &LpipsError| tracing::warn!("quality.lpips_holdout stays null: {e}");
+    let distance = distance.inspect_err(failed).ok();
+    if distance.is_none() {
+        *lpips = None;
+    }
+    distance
 }
 
 fn mean(values: &[f64]) -> Option<f64> {

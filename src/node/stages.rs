@@ -249,6 +249,10 @@ impl MapStage {
         let watch = Stopwatch::start();
         self.make_steps(target, &|_| Phase::Streaming, publish);
         self.optimise_secs += watch.secs();
+        if self.map.fault().is_some() {
+            // Nothing that still comes could be mapped.
+            self.stop.ask();
+        }
         self.snapshot_if_due(publish);
     }
 

@@ -143,6 +143,31 @@ pub fn raw(image: &Image) -> Result<RgbImage, DecodeError> {
 
 /// JPEG or PNG, told by its first bytes: the `format` text of real drivers says too little.
 pub fn compressed(bytes: &[u8]) -> Result<RgbImage, DecodeError> {
+    let picture = picture_of(bytes)?.into_rgb8();
+    Ok(RgbImage {
+        width_px: picture.width(),
+        height_px: picture.height(),
+        pixels: picture.into_raw(),
+    })
+}
+
+/// A 16-bit grey PNG of millimetres.
+pub fn depth_png(bytes: &[u8]) -> Result<DepthMap, DecodeError> {
+    let image::DynamicImage::ImageLuma16(picture) = picture_of(bytes)? else {
+        return Err(DecodeError::Compressed {
+            found_bytes: bytes.len(),
+            reason: "depth that is no 16-bit grey PNG".to_owned(),
+        });
+    };
+    let depth = picture.pixels().map(|p| depth_of_millimetres(p.0[0]));
+    Ok(depth_map(
+        picture.width(),
+        picture.height(),
+        depth.collect(),
+    ))
+}
+
+fn picture_of(bytes: &[u8]) -> Result<image::DynamicImage, DecodeError> {
     let fail = |reason: String| DecodeError::Compressed {
         found_bytes: bytes.len(),
         reason,
@@ -170,17 +195,11 @@ pub fn compressed(bytes: &[u8]) -> Result<RgbImage, DecodeError> {
             "{width_px}x{height_px} px, more than its length can hold"
         )));
     }
-    let picture = image::DynamicImage::from_decoder(decoder)
-        .map_err(|e| fail(e.to_string()))?
-        .into_rgb8();
+    let picture = image::DynamicImage::from_decoder(decoder).map_err(|e| fail(e.to_string()))?;
     if width_px == 0 || height_px == 0 {
         return Err(fail("picture without pixels".to_owned()));
     }
-    Ok(RgbImage {
-        width_px,
-        height_px,
-        pixels: picture.into_raw(),
-    })
+    Ok(picture)
 }
 
 /// Depth in metres; 0 where the sensor had none. Exact by agreement, so confidence is 1 wherever there is a value.

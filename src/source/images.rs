@@ -1,44 +1,80 @@
 //! A folder of pictures -> frames.
 //!
 //! With `images.txt` (lines `seconds path`), `intrinsics.json` and `poses_tum.txt` where they are; without a list,
-//! the JPEG and PNG files in natural order of their names, with made-up stamps 0.1 s apart.
+//! the JPEG and PNG files in natural order of their names, with made-up stamps 0.1 s apart. Scenes of other programs
+//! (`scene_formats`) are folders, too: their pictures come with poses and lenses.
 
+use std::collections::BTreeSet;
 use std::path::{Component, Path, PathBuf};
+
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_pcg::Pcg64Mcg;
 
 use crate::camera::Lens;
 use crate::clock::Stamp;
 use crate::config::SourceParams;
-use crate::frame::Frame;
+use crate::frame::{DepthMap, Frame};
+use crate::pose::{Rigid, extent};
 use crate::source::calibration::lens_of_json;
 use crate::source::intake::{Extras, Intake};
+use crate::source::scene_formats::{Layout, MADE_UP_GAP_NANOS, SceneView, is_named};
 use crate::source::truth::{Track, half_interval, stamp_of_decimal, track_of_tum};
 use crate::source::{Source, SourceCounts, SourceError, natural_order, read_small};
 
-/// Gap between the made-up stamps of pictures without a list.
-const MADE_UP_GAP_NANOS: i64 = 100_000_000;
 /// Lists and trajectories: a million lines.
 const MAX_TEXT_BYTES: u64 = 128 << 20;
 /// One picture file.
 const MAX_PICTURE_BYTES: u64 = 256 << 20;
+/// Added to the seed for the choice of pictures.
+const PICK_STREAM: u64 = 0x5eed_71cc;
 const MAX_PICTURES: usize = 1_000_000;
 
 #[derive(Debug)]
 struct Entry {
     stamp: Stamp,
     path: PathBuf,
+    truth: Option<Rigid>,
+    /// Its own, where the pictures differ.
+    lens: Option<Lens>,
+    /// 16-bit PNG, millimetres.
+    depth: Option<PathBuf>,
+    is_held_out: bool,
+}
+
+impl Entry {
+    /// Of which nothing but the picture is known.
+    fn bare(stamp: Stamp, path: PathBuf) -> Self {
+        Self {
+            stamp,
+            path,
+            truth: None,
+            lens: None,
+            depth: None,
+            is_held_out: false,
+        }
+    }
+
+    fn name(&self) -> &str {
+        let name = self.path.file_name().and_then(|name| name.to_str());
+        name.unwrap_or_default()
+    }
 }
 
 #[derive(Debug)]
 pub struct ImagesSource {
     entries: std::vec::IntoIter<Entry>,
-    truth: Track,
-    truth_within_nanos: i64,
+    truth_extent: Option<f64>,
     max_frames: u64,
     intake: Intake,
 }
 
 impl ImagesSource {
-    pub fn open(folder: &Path, params: &SourceParams) -> Result<Self, SourceError> {
+    /// A folder, or the transforms.json of a scene.
+    pub fn open(folder: &Path, params: &SourceParams, seed: u64) -> Result<Self, SourceError> {
+        if let Some(layout) = scene_layout(folder) {
+            return Self::of_scene(folder, &layout, params, seed);
+        }
         let fail = |reason: String, way_out| SourceError::Open {
             what: "folder of pictures",
             reason,
@@ -46,7 +82,7 @@ impl ImagesSource {
             path: folder.to_owned(),
         };
         let list = folder.join("images.txt");
-        let entries = if list.exists() {
+        let mut entries = if list.exists() {
             let text = read_text(&list)
                 .map_err(|reason| fail(reason, "make images.txt a readable text file"))?;
             entries_of_list(folder, &text)
@@ -54,6 +90,10 @@ impl ImagesSource {
             entries_of_folder(folder)
                 .map_err(|reason| fail(reason, "name a folder with JPEG or PNG files"))?
         };
+        entries.retain(|entry| {
+            let name = entry.name();
+            params.names.is_empty() || is_named(name, &params.names)
+        });
         if entries.is_empty() {
             return Err(fail(
                 "no pictures".to_owned(),
@@ -71,12 +111,62 @@ impl ImagesSource {
             ));
         }
         let stamps: Vec<Stamp> = entries.iter().take(1000).map(|entry| entry.stamp).collect();
+        let (track, within_nanos) = (truth_of(folder), half_interval(&stamps));
+        let mut entries = picked(entries, params.pick, seed);
+        for entry in &mut entries {
+            entry.is_held_out = is_named(entry.name(), &params.held_out_names);
+            entry.truth = track.nearest(entry.stamp, within_nanos);
+        }
         Ok(Self {
             entries: entries.into_iter(),
-            truth: truth_of(folder),
-            truth_within_nanos: half_interval(&stamps),
+            truth_extent: track.extent(),
             max_frames: params.max_frames,
             intake: Intake::new(params, lens_of(folder)),
+        })
+    }
+
+    fn of_scene(
+        path: &Path,
+        layout: &Layout,
+        params: &SourceParams,
+        seed: u64,
+    ) -> Result<Self, SourceError> {
+        let views = layout.views(params.max_side)?;
+        let centres: Vec<_> = views.iter().map(|v| v.world_from_cam.translation).collect();
+        let n_listed = views.len();
+        let entries: Vec<Entry> = views
+            .into_iter()
+            .filter(|view| params.names.is_empty() || is_named(&view.name, &params.names))
+            .map(|view| entry_of_view(view, params))
+            .collect();
+        let entries = picked(entries, params.pick, seed);
+        let n_there = entries.iter().filter(|entry| entry.path.is_file()).count();
+        let n_held_out = entries.iter().filter(|entry| entry.is_held_out).count();
+        tracing::info!(
+            "{} of {n_listed} views of the scene, {n_held_out} of them held out: {}",
+            entries.len(),
+            path.display()
+        );
+        if n_there < entries.len() {
+            let n_missing = entries.len() - n_there;
+            tracing::warn!(
+                "{n_missing} pictures of the scene are missing: {}",
+                path.display()
+            );
+        }
+        if n_there == 0 {
+            return Err(SourceError::Open {
+                what: "scene",
+                reason: format!("none of its {} pictures is there", entries.len()),
+                way_out: "put them into images beside it, or check source.names",
+                path: path.to_owned(),
+            });
+        }
+        Ok(Self {
+            entries: entries.into_iter(),
+            truth_extent: Some(extent(&centres)),
+            max_frames: params.max_frames,
+            intake: Intake::new(params, None),
         })
     }
 
@@ -85,15 +175,13 @@ impl ImagesSource {
         let bytes = read_small(&entry.path, MAX_PICTURE_BYTES);
         match bytes.and_then(|bytes| super::decode::compressed(&bytes).map_err(|e| e.to_string())) {
             Ok(picture) => {
-                let truth = self.truth.nearest(entry.stamp, self.truth_within_nanos);
-                self.intake.frame(
-                    arrival,
-                    picture,
-                    Extras {
-                        truth,
-                        truth_depth: None,
-                    },
-                )
+                let extras = Extras {
+                    truth: entry.truth,
+                    truth_depth: self.depth_of(entry),
+                    lens: entry.lens,
+                    is_held_out: entry.is_held_out,
+                };
+                self.intake.frame(arrival, picture, extras)
             }
             Err(reason) => {
                 self.intake
@@ -101,6 +189,53 @@ impl ImagesSource {
                 None
             }
         }
+    }
+
+    fn depth_of(&mut self, entry: &Entry) -> Option<DepthMap> {
+        let path = entry.depth.as_ref()?;
+        let bytes = read_small(path, MAX_PICTURE_BYTES);
+        let depth =
+            bytes.and_then(|bytes| super::decode::depth_png(&bytes).map_err(|e| e.to_string()));
+        let warn = |reason: &String| {
+            let text = format!("depth pictures are left out: {reason}: {}", path.display());
+            self.intake.warn_once("depth", &text);
+        };
+        depth.inspect_err(warn).ok()
+    }
+}
+
+/// So many of the entries, drawn by the seed, in their order; 0 keeps all.
+fn picked(mut entries: Vec<Entry>, n: usize, seed: u64) -> Vec<Entry> {
+    if n > 0 && n < entries.len() {
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ PICK_STREAM);
+        let mut order: Vec<usize> = (0..entries.len()).collect();
+        order.shuffle(&mut rng);
+        let chosen: BTreeSet<usize> = order.into_iter().take(n).collect();
+        let mut ix = 0;
+        entries.retain(|_| {
+            ix += 1;
+            chosen.contains(&(ix - 1))
+        });
+    }
+    entries
+}
+
+/// `None`: a folder of our own kind, which its list tells from a COLMAP text model.
+fn scene_layout(path: &Path) -> Option<Layout> {
+    let layout = Layout::find(path)?;
+    let is_own = path.join("images.txt").is_file();
+    let is_model = matches!(&layout, Layout::Colmap { model, .. } if model == path);
+    (!is_own || is_model).then_some(layout)
+}
+
+fn entry_of_view(view: SceneView, params: &SourceParams) -> Entry {
+    Entry {
+        is_held_out: view.is_held_out || is_named(&view.name, &params.held_out_names),
+        stamp: view.stamp,
+        path: view.picture,
+        truth: Some(view.world_from_cam),
+        lens: view.lens,
+        depth: view.depth,
     }
 }
 
@@ -129,11 +264,16 @@ impl Source for ImagesSource {
             left.min(self.max_frames.saturating_sub(frames_out))
         })
     }
+
+    fn truth_extent(&self) -> Option<f64> {
+        self.truth_extent
+    }
 }
 
 /// Whether a folder looks like one of pictures.
 pub(super) fn has_pictures(folder: &Path) -> bool {
     folder.join("images.txt").is_file()
+        || scene_layout(folder).is_some()
         || entries_of_folder(folder).is_ok_and(|entries| !entries.is_empty())
 }
 
@@ -176,10 +316,8 @@ fn entry_of_line(folder: &Path, line: &str) -> Option<Entry> {
     let stays_inside = path
         .components()
         .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
-    stays_inside.then_some(Entry {
-        stamp: stamp_of_decimal(stamp)?,
-        path: folder.join(path),
-    })
+    let stamp = stamp_of_decimal(stamp)?;
+    stays_inside.then(|| Entry::bare(stamp, folder.join(path)))
 }
 
 fn entries_of_folder(folder: &Path) -> Result<Vec<Entry>, String> {
@@ -197,10 +335,8 @@ fn entries_of_folder(folder: &Path) -> Result<Vec<Entry>, String> {
         .take(MAX_PICTURES)
         .collect();
     paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
-    let with_stamp = |(ix, path)| Entry {
-        stamp: Stamp::from_nanos(ix as i64 * MADE_UP_GAP_NANOS),
-        path,
-    };
+    let with_stamp =
+        |(ix, path)| Entry::bare(Stamp::from_nanos(ix as i64 * MADE_UP_GAP_NANOS), path);
     Ok(paths.into_iter().enumerate().map(with_stamp).collect())
 }
 

@@ -24,6 +24,9 @@ const MAX_WAIT_SECS: f64 = 2.0;
 pub struct Extras {
     pub truth: Option<Rigid>,
     pub truth_depth: Option<DepthMap>,
+    /// This picture's own lens, where the pictures of an input differ; their sizes may then differ, too.
+    pub lens: Option<Lens>,
+    pub is_held_out: bool,
 }
 
 /// A picture that was counted and may become a frame.
@@ -33,9 +36,10 @@ pub struct Arrival {
     pub stamp: Stamp,
 }
 
-/// How pictures of the first picture's size become frames.
+/// How pictures of one size, taken through one lens, become frames.
 #[derive(Debug)]
 struct Working {
+    lens: Option<Lens>,
     source_size: (u32, u32),
     size: (u32, u32),
     intrinsics: Option<Intrinsics>,
@@ -130,8 +134,14 @@ impl Intake {
     /// The frame of a decoded picture; `None`, and a count, where its size is not that of the first one.
     pub fn frame(&mut self, arrival: Arrival, picture: RgbImage, extras: Extras) -> Option<Frame> {
         let size = (picture.width_px, picture.height_px);
-        if self.working.is_none() {
-            self.working = Some(self.prepare(size));
+        let lens = extras.lens.or(self.lens);
+        let has_own_lens = extras.lens.is_some();
+        let is_ready = self
+            .working
+            .as_ref()
+            .is_some_and(|w| w.lens == lens && (w.source_size == size || !has_own_lens));
+        if !is_ready {
+            self.working = Some(self.prepare(lens, size));
         }
         let working = self.working.take().expect("made above");
         let frame = if working.source_size == size {
@@ -173,18 +183,21 @@ impl Intake {
             intrinsics: working.intrinsics,
             truth: extras.truth,
             truth_depth,
+            is_held_out: extras.is_held_out,
         }
     }
 
-    fn prepare(&mut self, source_size: (u32, u32)) -> Working {
+    fn prepare(&mut self, lens: Option<Lens>, source_size: (u32, u32)) -> Working {
         let size = size_within(source_size, self.params.max_side);
+        let key = lens;
         let plain = |intrinsics| Working {
+            lens: key,
             source_size,
             size,
             intrinsics,
             rectifier: None,
         };
-        let Some(lens) = self.lens else {
+        let Some(lens) = lens else {
             return plain(None);
         };
         let lens = match lens_for_size(&lens, source_size.0, source_size.1) {
@@ -209,6 +222,7 @@ impl Intake {
             return plain(None);
         };
         Working {
+            lens: key,
             source_size,
             size,
             intrinsics: Some(rectifier.pinhole),

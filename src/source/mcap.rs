@@ -171,8 +171,15 @@ impl McapSource {
             }
             None => None,
         };
-        self.intake
-            .frame(arrival, picture, Extras { truth, truth_depth })
+        self.intake.frame(
+            arrival,
+            picture,
+            Extras {
+                truth,
+                truth_depth,
+                ..Extras::default()
+            },
+        )
     }
 }
 
@@ -206,6 +213,10 @@ impl Source for McapSource {
             self.max_frames.saturating_sub(frames_out)
         };
         Some(left.min(room))
+    }
+
+    fn truth_extent(&self) -> Option<f64> {
+        self.truth.extent()
     }
 }
 

@@ -8,6 +8,7 @@ pub mod images;
 pub mod intake;
 pub mod mcap;
 pub mod rectify;
+pub mod scene_formats;
 pub mod synthetic;
 
 mod bag;
@@ -69,6 +70,9 @@ pub trait Source: Send {
 
     /// Frames still to come, where the source knows (for the progress bar).
     fn len_hint(&self) -> Option<u64>;
+
+    /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
+    fn truth_extent(&self) -> Option<f64>;
 }
 
 /// Opens `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
@@ -81,7 +85,7 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
     };
     match uri.split_once(':') {
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
-        Some(("images", path)) => open_images(Path::new(path), params),
+        Some(("images", path)) => open_images(Path::new(path), params, seed),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
         Some(("v4l2" | "webcam", _)) => not_in_build(
             "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
@@ -89,7 +93,7 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("ros2" | "zenoh", _)) => not_in_build(
             "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
         ),
-        _ => open_path(uri, params),
+        _ => open_path(uri, params, seed),
     }
 }
 
@@ -97,8 +101,12 @@ fn open_mcap(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, Sour
     Ok(Box::new(mcap::McapSource::open(path, params)?))
 }
 
-fn open_images(path: &Path, params: &SourceParams) -> Result<Box<dyn Source>, SourceError> {
-    Ok(Box::new(images::ImagesSource::open(path, params)?))
+fn open_images(
+    path: &Path,
+    params: &SourceParams,
+    seed: u64,
+) -> Result<Box<dyn Source>, SourceError> {
+    Ok(Box::new(images::ImagesSource::open(path, params, seed)?))
 }
 
 fn open_synthetic(
@@ -112,8 +120,14 @@ fn open_synthetic(
 }
 
 /// A folder is a recording when MCAP files lie in it, else pictures, else a scene with its recording in `rosbag2`.
-fn open_path(uri: &str, params: &SourceParams) -> Result<Box<dyn Source>, SourceError> {
+fn open_path(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
     let path = Path::new(uri);
+    let is_json = path
+        .extension()
+        .is_some_and(|extension| extension == "json");
+    if path.is_file() && is_json {
+        return open_images(path, params, seed);
+    }
     if path.is_file() {
         return open_mcap(path, params);
     }
@@ -136,7 +150,7 @@ fn open_path(uri: &str, params: &SourceParams) -> Result<Box<dyn Source>, Source
     }
     let inner = path.join("rosbag2");
     let pictures = if images::has_pictures(path) {
-        Some(open_images(path, params))
+        Some(open_images(path, params, seed))
     } else {
         None
     };

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use crate::clock::Stamp;
-use crate::pose::Rigid;
+use crate::pose::{Rigid, extent};
 use crate::ros::TfMessage;
 
 /// Poses and transforms kept of one recording: an hour at 100 Hz, in 35 MB.
@@ -29,6 +29,14 @@ pub(super) enum Truth {
 }
 
 impl Truth {
+    /// A chain of transforms has none until it is walked.
+    pub(super) fn extent(&self) -> Option<f64> {
+        match self {
+            Self::Track(track) => track.extent(),
+            Self::None | Self::Transforms { .. } => None,
+        }
+    }
+
     pub(super) fn at(&self, stamp: Stamp, within_nanos: i64) -> Option<Rigid> {
         match self {
             Self::None => None,
@@ -59,6 +67,12 @@ impl Track {
 
     pub(super) fn is_empty(&self) -> bool {
         self.by_nanos.is_empty()
+    }
+
+    /// Largest distance between two positions.
+    pub(super) fn extent(&self) -> Option<f64> {
+        let positions: Vec<_> = self.by_nanos.values().map(|p| p.translation).collect();
+        (!positions.is_empty()).then(|| extent(&positions))
     }
 
     /// The pose nearest in time, if it is at most `within_nanos` away.

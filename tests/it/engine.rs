@@ -9,7 +9,7 @@ use splat_mapper::camera::Intrinsics;
 use splat_mapper::frame::{DepthMap, RgbImage};
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::CpuEngine;
-use splat_mapper::splat::{Engine, Rendering, Splats, StepSettings, TrainingView};
+use splat_mapper::splat::{Engine, PoseStep, Rendering, Splats, StepSettings, TrainingView};
 
 const WIDTH_PX: u32 = 61;
 const HEIGHT_PX: u32 = 45;
@@ -157,6 +157,7 @@ fn tiny_pictures_and_empty_maps_render_black() {
                 intrinsics: camera,
                 cam_from_map: Rigid::IDENTITY,
                 depth: None,
+                mask: None,
             };
             let view_ix = engine.add_view(view);
             engine.step(view_ix, &settings());
@@ -187,7 +188,7 @@ fn a_pose_finds_back_while_the_splats_are_frozen() {
         let rate = 2e-3 * 0.985_f32.powi(step);
         let only_pose = StepSettings {
             train_splats: false,
-            train_pose: true,
+            pose: PoseStep::Direct,
             lr_pose_rotation: rate,
             lr_pose_translation: rate,
             ..settings()
@@ -277,6 +278,7 @@ fn photograph(splats: &Splats, cam_from_map: &Rigid) -> TrainingView {
             depth: picture.depth,
             confidence,
         })),
+        mask: None,
     }
 }
 
@@ -366,6 +368,7 @@ fn settings() -> StepSettings {
         scale_reg: 0.001,
         sh_degree: 3,
         train_splats: true,
-        train_pose: true,
+        pose: PoseStep::Direct,
+        ..StepSettings::default()
     }
 }

@@ -7,10 +7,10 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use splat_mapper::clock::Stamp;
 use splat_mapper::eval::align::{AlignError, align, umeyama};
-use splat_mapper::eval::evaluation::{compare, evaluate, extent};
+use splat_mapper::eval::evaluation::{compare, evaluate};
 use splat_mapper::eval::report::{Quality, Report};
 use splat_mapper::eval::trajectory::{TimedPose, read_tum, write_tum};
-use splat_mapper::pose::{Rigid, Similarity};
+use splat_mapper::pose::{Rigid, Similarity, extent};
 
 use crate::scenes::scene;
 

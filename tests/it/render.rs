@@ -2,7 +2,7 @@
 
 use splat_mapper::splat::Rendering;
 
-use crate::backends::BACKENDS;
+use crate::backends::{BACKENDS, Backend};
 use crate::reference::hostile::{KINDS, camera};
 use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::raster::Raster;
@@ -153,7 +153,9 @@ fn rounded(raster: &Raster) -> Rendering {
 fn every_backends_pictures_are_the_twins() {
     for backend in BACKENDS {
         assert!(backend.picture_error <= MAX_ERROR && backend.gradient_error <= MAX_GRADIENT_ERROR);
-        if let Err(failures) = check(backend.picture_error, |scene| backend.render(scene)) {
+        let mut engine = (backend.engine)();
+        let render = |scene: &Scene| Backend::render(engine.as_mut(), scene);
+        if let Err(failures) = check(backend.picture_error, render) {
             panic!("{}:\n{failures}", backend.name);
         }
     }

@@ -5,7 +5,10 @@ use splat_mapper::camera::Intrinsics;
 use splat_mapper::clock::Stamp;
 use splat_mapper::eval::render::{read_intrinsics, render_poses};
 use splat_mapper::pose::Rigid;
-use splat_mapper::splat::{Engine, Rendering, Splats, StepSettings, StepStats, TrainingView};
+use splat_mapper::splat::{
+    Engine, Match, McmcSettings, RefinerSettings, Rendering, Splats, StepSettings, StepStats,
+    TrainingView,
+};
 
 use crate::scenes::scene;
 
@@ -31,7 +34,23 @@ impl Engine for Ramp {
         0
     }
     fn set_pose(&mut self, _: usize, _: Rigid) {}
+    fn set_intrinsics(&mut self, _: usize, _: &Intrinsics) {}
     fn set_depth(&mut self, _: usize, _: Option<std::sync::Arc<splat_mapper::frame::DepthMap>>) {}
+    fn start_refiner(&mut self, _: &RefinerSettings) {}
+    fn set_mask(&mut self, _: usize, _: Option<std::sync::Arc<[u8]>>) {}
+    fn set_matches(&mut self, _: usize, _: &[Match]) {}
+    fn relocate_and_grow(&mut self, _: &McmcSettings) -> usize {
+        self.n_splats
+    }
+    fn focal_factor(&mut self) -> f64 {
+        1.0
+    }
+    fn exposures(&mut self) -> Vec<[[f32; 3]; 2]> {
+        Vec::new()
+    }
+    fn peak_gpu_bytes(&self) -> u64 {
+        0
+    }
     fn step(&mut self, _: usize, _: &StepSettings) {}
     fn take_stats(&mut self) -> StepStats {
         StepStats::default()

@@ -191,13 +191,15 @@ fn a_recording_that_is_cut_off_is_used_up_to_the_fault() {
 
 #[test]
 fn a_stage_that_fails_keeps_what_was_gathered_and_says_so() {
-    // A recording without ground truth: known geometry cannot answer.
-    let Some(scene) = scene("static_euroc") else {
-        return;
-    };
+    // Pictures without ground truth: known geometry cannot answer.
     let folder = tempfile::tempdir().unwrap();
+    let pictures = tempfile::tempdir().unwrap();
+    for name in ["1.png", "2.png"] {
+        let picture = image::RgbImage::new(64, 48);
+        picture.save(pictures.path().join(name)).unwrap();
+    }
     let output = replay(
-        scene.to_str().unwrap(),
+        pictures.path().to_str().unwrap(),
         folder.path(),
         &["--geometry", "known"],
     );
@@ -262,7 +264,6 @@ fn bad_arguments_end_with_one_line_and_their_code() {
         1,
         &["ONNX", "--geometry sfm"],
     );
-    check(&["replay", DEMO, "--backend", "wgpu"], 1, &["wgpu", "cpu"]);
     assert_eq!(program(&["bogus"]).output().unwrap().status.code(), Some(2));
 }
 

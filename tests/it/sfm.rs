@@ -69,6 +69,7 @@ pub(crate) fn keyframe(
         intrinsics: calibrated.then(|| lens.resized(w, h)),
         truth: None,
         truth_depth: None,
+        is_held_out: false,
     };
     Arc::new(Keyframe {
         id,
@@ -134,8 +135,8 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
         for view in &out.views {
             poses.insert(view.keyframe_id, (view.component, view.batch_from_cam));
         }
-        for (id, component, pose) in &out.revised {
-            poses.insert(*id, (*component, *pose));
+        for new in &out.revised {
+            poses.insert(new.keyframe_id, (new.component, new.batch_from_cam));
         }
     };
     let (mut from, mut batch_id) = (0, 0);

@@ -5,29 +5,61 @@ use std::collections::BTreeSet;
 use std::mem::{offset_of, size_of};
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::valid::{ShaderStages, SubgroupOperationSet};
 use naga::{AddressSpace, Module, ScalarKind, StorageAccess, TypeInner};
-use splat_mapper::gpu::kernel::{ALL, Access, Kernel, LIB, PROJECT, expand};
-use splat_mapper::gpu::types::{Camera, ProjectedSplat};
+use splat_mapper::gpu::kernel::{ALL, Access, Kernel, LIB, Lanes, PROJECT};
+use splat_mapper::gpu::types::{self, Camera, Moves, Projected, SortPass, Step};
 
-fn module(source: &str) -> Result<Module, String> {
-    let text = expand(source).ok_or("an #import names no file of shaders/lib")?;
+/// Without and with subgroups, as adapters have them.
+const LANES: [Lanes; 4] = [
+    Lanes {
+        n: 32,
+        are_subgroup: false,
+    },
+    Lanes {
+        n: 8,
+        are_subgroup: true,
+    },
+    Lanes {
+        n: 32,
+        are_subgroup: true,
+    },
+    Lanes {
+        n: 64,
+        are_subgroup: true,
+    },
+];
+/// What WebGPU guarantees to every stage, and to a uniform.
+const MAX_STORAGE_BINDINGS: usize = 8;
+
+fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
+    let text = kernel
+        .text(lanes)
+        .ok_or("an #import names no file of shaders/lib, or a #repeat has no end")?;
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| e.emit_to_string(&text))?;
-    Validator::new(ValidationFlags::all(), Capabilities::empty())
+    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::SUBGROUP);
+    if lanes.are_subgroup {
+        validator
+            .subgroup_stages(ShaderStages::COMPUTE)
+            .subgroup_operations(SubgroupOperationSet::all());
+    }
+    validator
         .validate(&module)
         .map_err(|e| e.emit_to_string(&text))?;
     Ok(module)
 }
 
 /// What a shader differs in from its entry in the table.
-fn faults(kernel: &Kernel) -> Result<(), String> {
-    let module = module(kernel.source)?;
+fn faults(kernel: &Kernel, lanes: Lanes) -> Result<(), String> {
+    let module = module(kernel, lanes)?;
     let [entry] = &module.entry_points[..] else {
         return Err("one entry point expected".into());
     };
-    if entry.name != "main" || entry.workgroup_size != kernel.workgroup_size {
+    let workgroup_size = [kernel.width(lanes), 1, 1];
+    if entry.name != "main" || entry.workgroup_size != workgroup_size {
         return Err(format!(
-            "{} {:?}, table has {:?}",
-            entry.name, entry.workgroup_size, kernel.workgroup_size
+            "{} {:?}, table has {workgroup_size:?}",
+            entry.name, entry.workgroup_size
         ));
     }
     let mut found: Vec<(u32, String, Access)> = Vec::new();
@@ -59,6 +91,13 @@ fn faults(kernel: &Kernel) -> Result<(), String> {
         .zip(0..)
         .map(|((name, access), i)| (i, (*name).to_owned(), *access))
         .collect();
+    let n_storage = expected
+        .iter()
+        .filter(|(.., access)| *access != Access::Uniform)
+        .count();
+    if n_storage > MAX_STORAGE_BINDINGS {
+        return Err(format!("{n_storage} storage buffers"));
+    }
     if found == expected {
         Ok(())
     } else {
@@ -129,8 +168,11 @@ macro_rules! host_layout {
 
 #[test]
 fn every_shader_is_valid_and_as_the_table_says() {
-    for kernel in ALL {
-        faults(kernel).unwrap_or_else(|e| panic!("shaders/{}.wgsl: {e}", kernel.name));
+    for lanes in LANES {
+        for kernel in ALL {
+            faults(kernel, lanes)
+                .unwrap_or_else(|e| panic!("shaders/{}.wgsl, {lanes:?}: {e}", kernel.name));
+        }
     }
 }
 
@@ -156,32 +198,174 @@ fn the_table_lists_every_file() {
 }
 
 #[test]
-fn shared_structs_have_the_layout_of_the_host() {
-    let module = module(PROJECT.source).unwrap();
+fn the_step_has_the_layout_of_the_host() {
+    let step: Layout = host_layout!(
+        Step,
+        width_px,
+        height_px,
+        n_tiles_x,
+        n_tiles_y,
+        n_splats,
+        max_instances,
+        view_ix,
+        n_steps,
+        sh_degree,
+        sh_stored,
+        sh_interval,
+        flags,
+        depth_mode,
+        depth_width,
+        depth_height,
+        lr_mean,
+        lr_scale,
+        lr_quat,
+        lr_opacity,
+        lr_sh0,
+        lr_sh_rest,
+        lr_rotation,
+        lr_translation,
+        lr_refiner,
+        lr_focal,
+        lr_exposure,
+        noise,
+        noise_seed,
+        ssim_weight,
+        depth_weight,
+        opacity_reg,
+        scale_reg,
+        mask_sum,
+        confidence_sum,
+        camera_scale,
+        epipolar_rho_x,
+        epipolar_rho_y,
+        epipolar_rho_z,
+        epipolar_theta_x,
+        epipolar_theta_y,
+        epipolar_theta_z
+    );
+    assert_eq!(layout_in("Step", &PROJECT), step);
+}
+
+fn layout_in(name: &str, kernel: &Kernel) -> Layout {
+    wgsl_layout(&module(kernel, LANES[0]).unwrap(), name)
+}
+
+#[test]
+fn other_shared_structs_have_the_layout_of_the_host() {
     let camera: Layout = host_layout!(
         Camera,
         rotation_x,
         rotation_y,
         rotation_z,
         translation,
+        center,
         pinhole,
-        width_px,
-        height_px,
-        n_splats,
-        sh_degree
+        slope_bounds,
+        gain,
+        offset,
+        n_visible,
+        n_instances,
+        is_full,
+        n_wanted,
+        n_done,
+        padding_0,
+        padding_1,
+        padding_2
     );
-    assert_eq!(wgsl_layout(&module, "Camera"), camera);
+    assert_eq!(layout_in("Camera", &PROJECT), camera);
     let projected: Layout = host_layout!(
-        ProjectedSplat,
-        mean_px,
+        Projected,
+        center_px,
         depth,
         opacity,
-        conic,
-        colour,
+        conic_a,
+        conic_b,
+        conic_c,
+        splat_ix,
+        red,
+        green,
+        blue,
+        cut,
         extent_px,
-        padding
+        n_tiles,
+        first_instance
     );
-    assert_eq!(wgsl_layout(&module, "ProjectedSplat"), projected);
+    assert_eq!(layout_in("Projected", &PROJECT), projected);
+    let sort_pass: Layout = host_layout!(SortPass, shift, padding_0, padding_1, padding_2);
+    assert_eq!(layout_in("SortPass", &kernel("sort_count")), sort_pass);
+    let moves: Layout = host_layout!(
+        Moves,
+        n_splats,
+        n_added,
+        seed,
+        kind,
+        weight_bits,
+        active_steps,
+        n_steps,
+        sh_stored,
+        min_opacity,
+        padding_0,
+        padding_1,
+        padding_2
+    );
+    assert_eq!(layout_in("Moves", &kernel("move_draw")), moves);
+}
+
+fn kernel(name: &str) -> Kernel {
+    let found = ALL.iter().find(|kernel| kernel.name == name).unwrap();
+    Kernel { ..**found }
+}
+
+#[test]
+fn shared_numbers_are_those_of_the_host() {
+    let check = |name: &str, constant: &str, expected: u64| {
+        let module = module(&kernel(name), LANES[0]).unwrap();
+        let found = module
+            .constants
+            .iter()
+            .find(|(_, found)| found.name.as_deref() == Some(constant))
+            .map(|(_, found)| &module.global_expressions[found.init]);
+        let Some(naga::Expression::Literal(naga::Literal::U32(found))) = found else {
+            panic!("{constant} of {name} is {found:?}");
+        };
+        assert_eq!(u64::from(*found), expected, "{constant}");
+    };
+    check("sort_count", "SORT_BLOCK", u64::from(types::SORT_BLOCK));
+    check("scan_sums", "SCAN_BLOCK", u64::from(types::SCAN_BLOCK));
+    check("project", "TILE_PX", u64::from(types::TILE_PX));
+    for (constant, expected) in [
+        ("ARGS_VISIBLE", types::ARGS_VISIBLE),
+        ("ARGS_SORT_VISIBLE", types::ARGS_SORT_VISIBLE),
+        ("ARGS_INSTANCES", types::ARGS_INSTANCES),
+        ("ARGS_SORT_INSTANCES", types::ARGS_SORT_INSTANCES),
+    ] {
+        check("instance_args", constant, expected);
+    }
+    for (constant, expected) in [
+        ("VIEW_QUAT", types::VIEW_QUAT),
+        ("VIEW_TRANSLATION", types::VIEW_TRANSLATION),
+        ("VIEW_PINHOLE", types::VIEW_PINHOLE),
+        ("VIEW_EXPOSURE", types::VIEW_EXPOSURE),
+        ("VIEW_POSE_M", types::VIEW_POSE_M),
+        ("VIEW_POSE_AGE", types::VIEW_POSE_AGE),
+        ("VIEW_EMBEDDING_AGE", types::VIEW_EMBEDDING_AGE),
+        ("VIEW_EMBEDDING", types::VIEW_EMBEDDING),
+        ("VIEW_STRIDE", types::VIEW_STRIDE),
+        ("NET_SIZE", types::NET_SIZE),
+        ("LOG_FOCAL", types::LOG_FOCAL),
+    ] {
+        check("update_view", constant, expected as u64);
+    }
+    for (constant, expected) in [
+        ("FLAG_TRAIN_SPLATS", types::FLAG_TRAIN_SPLATS),
+        ("FLAG_GRADIENTS", types::FLAG_GRADIENTS),
+        ("FLAG_POSE_DIRECT", types::FLAG_POSE_DIRECT),
+        ("FLAG_POSE_SHARED", types::FLAG_POSE_SHARED),
+        ("FLAG_DEPTH", types::FLAG_DEPTH),
+        ("FLAG_REFINER", types::FLAG_REFINER),
+    ] {
+        check("update_view", constant, u64::from(expected));
+    }
 }
 
 #[test]
@@ -192,15 +376,15 @@ fn seeded_faults_are_seen() {
             "{from:?} is not in the shader"
         );
         let source: &'static str = Box::leak(PROJECT.source.replace(from, to).into_boxed_str());
-        faults(&Kernel { source, ..PROJECT }).unwrap_err()
+        faults(&Kernel { source, ..PROJECT }, LANES[0]).unwrap_err()
     };
     seeded("@workgroup_size(256)", "@workgroup_size(64)");
     seeded(
-        "@binding(2) var<storage, read> log_scales",
-        "@binding(2) var<storage, read> scales",
+        "@binding(2) var<storage, read> geometry",
+        "@binding(2) var<storage, read> shapes",
     );
-    seeded("let p = cam_from_map(camera, ", "let p = cam_from_map(");
-    seeded("#import quat", "#import quaternion");
+    seeded("shape_of(camera, mean, ", "shape_of(camera, ");
+    seeded("#import shape", "#import shapes");
     seeded(
         "var<storage, read_write> projected",
         "var<storage, read> projected",

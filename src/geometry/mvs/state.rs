@@ -182,11 +182,6 @@ impl MvsState {
         worst
     }
 
-    /// Of the depth map. `None`: not held.
-    pub fn intrinsics(&self, keyframe_id: u32) -> Option<Intrinsics> {
-        Some(self.held.get(&keyframe_id)?.prepared.intrinsics)
-    }
-
     /// That the last sweep had; 0 for one that was never swept or is not held.
     pub fn n_sources(&self, keyframe_id: u32) -> usize {
         self.held

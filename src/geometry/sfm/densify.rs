@@ -8,7 +8,7 @@ use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::mvs::MvsView;
 use crate::geometry::mvs::neighbours::depth_range;
 use crate::geometry::mvs::state::MvsState;
-use crate::geometry::{GeometryBatch, View};
+use crate::geometry::{GeometryBatch, PoseError, Sightings, View};
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 96;
@@ -36,9 +36,11 @@ impl Densifier {
         sparse: SparseBatch,
         image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
     ) -> GeometryBatch {
-        for (id, _, pose) in &sparse.revised {
-            if let Some(intrinsics) = self.state.intrinsics(*id) {
-                self.state.revise(*id, intrinsics, *pose);
+        for revision in &sparse.revised {
+            let id = revision.keyframe_id;
+            if self.state.holds(id) {
+                self.state
+                    .revise(id, revision.intrinsics, revision.batch_from_cam);
             }
         }
         // All pictures first: the views of one batch are each other's best sources.
@@ -49,12 +51,20 @@ impl Densifier {
             self.sweep(view);
         }
         let views = sparse.views.iter().map(|view| self.view(view)).collect();
+        let sightings = sparse.views.iter().map(sightings).collect();
         GeometryBatch {
+            pose_error: PoseError::default(),
             batch_id: sparse.batch_id,
             views,
             revised: sparse.revised,
+            sightings,
             note: sparse.note,
         }
+    }
+
+    /// Whether its picture is still there to be matched again.
+    pub(super) fn holds(&self, keyframe_id: u32) -> bool {
+        self.state.holds(keyframe_id)
     }
 
     fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
@@ -105,19 +115,26 @@ impl Densifier {
     }
 
     fn view(&self, view: &SparseView) -> View {
-        let none = || DepthMap {
-            width_px: 0,
-            height_px: 0,
-            depth: Vec::new(),
-            confidence: Vec::new(),
-        };
         View {
             keyframe_id: view.keyframe_id,
             component: view.component,
             intrinsics: view.intrinsics,
             batch_from_cam: view.batch_from_cam,
-            depth: self.state.depth_of(view.keyframe_id).unwrap_or_else(none),
+            depth: self
+                .state
+                .depth_of(view.keyframe_id)
+                .unwrap_or_else(DepthMap::none),
             health: view.health,
         }
+    }
+}
+
+fn sightings(view: &SparseView) -> Sightings {
+    let landmarks = view.landmarks.iter();
+    Sightings {
+        keyframe_id: view.keyframe_id,
+        landmarks: landmarks
+            .map(|l| (l.landmark, l.pixel.as_vec2().to_array()))
+            .collect(),
     }
 }

@@ -10,6 +10,7 @@ mod landmarks;
 mod links;
 mod merging;
 mod placing;
+pub mod posed;
 mod report;
 mod scene;
 mod starting;
@@ -83,34 +84,12 @@ impl Sfm {
     /// Takes a batch; keyframes seen before are only reported again.
     pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
-        let limits = self.limits(&batch.keyframes);
-        let fresh: Vec<&Arc<Keyframe>> = batch
-            .keyframes
-            .iter()
-            .filter(|k| self.shot_of(k.id).is_none())
-            .collect();
-        let looked = |keyframe: &&Arc<Keyframe>| {
-            let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
-            (
-                features(&picture, self.sfm.max_features),
-                (picture.width as u32, picture.height as u32),
-            )
-        };
-        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
-        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
-            self.push(keyframe, features, size);
-            link_newest(&mut self.scene, limits.max_error_px, self.seed);
-        }
+        let limits = self.take_in(&batch.keyframes);
         let waiting = self.waiting();
         let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
         self.place_waiting(newest, &limits, MIN_NEW_COMPONENT);
         self.adjust_grown(&limits);
-        let shared: Vec<usize> = batch
-            .keyframes
-            .iter()
-            .take(batch.n_shared)
-            .filter_map(|k| self.shot_of(k.id))
-            .collect();
+        let shared = self.shared_shots(batch);
         self.tell(&shared)
     }
 
@@ -140,6 +119,34 @@ impl Sfm {
         out.batch_id = self.batch_id;
         out.note = note(&self.scene, self.last_start);
         out
+    }
+
+    /// Makes shots of the keyframes that are new, and links them to those before.
+    fn take_in(&mut self, keyframes: &[Arc<Keyframe>]) -> Limits {
+        let limits = self.limits(keyframes);
+        let fresh: Vec<&Arc<Keyframe>> = keyframes
+            .iter()
+            .filter(|k| self.shot_of(k.id).is_none())
+            .collect();
+        let looked = |keyframe: &&Arc<Keyframe>| {
+            let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
+            (
+                features(&picture, self.sfm.max_features),
+                (picture.width as u32, picture.height as u32),
+            )
+        };
+        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
+        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
+            self.push(keyframe, features, size);
+            link_newest(&mut self.scene, limits.max_error_px, self.seed);
+        }
+        limits
+    }
+
+    /// Shots of the keyframes that the batch before had, too.
+    fn shared_shots(&self, batch: &Batch) -> Vec<usize> {
+        let shared = batch.keyframes.iter().take(batch.n_shared);
+        shared.filter_map(|k| self.shot_of(k.id)).collect()
     }
 
     fn limits(&self, keyframes: &[Arc<Keyframe>]) -> Limits {

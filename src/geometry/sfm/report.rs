@@ -7,8 +7,8 @@ use glam::{DVec2, DVec3};
 use super::scene::{NONE, Scene};
 use super::starting::{Start, parallax_deg};
 use crate::camera::Intrinsics;
-use crate::geometry::Health;
 use crate::geometry::two_view::median;
+use crate::geometry::{Health, Revision};
 use crate::pose::Rigid;
 
 /// Exact words of the final error for a camera at rest; other modules and users look for them.
@@ -20,6 +20,8 @@ const MOVED: f64 = 1e-4;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sighting {
     pub point_in_batch: DVec3,
+    /// The same number for the same point in all views.
+    pub landmark: u32,
     /// In the keyframe's picture.
     pub pixel: DVec2,
 }
@@ -51,15 +53,15 @@ pub struct SparseView {
 pub struct SparseBatch {
     pub batch_id: u32,
     pub views: Vec<SparseView>,
-    /// (keyframe id, component, batch_from_cam) of views given earlier that moved.
-    pub revised: Vec<(u32, u32, Rigid)>,
+    /// Views given earlier that moved, or whose focal length did.
+    pub revised: Vec<Revision>,
     pub note: Option<String>,
 }
 
 /// What has been told of each keyframe.
 #[derive(Debug, Default)]
 pub(super) struct Told {
-    poses: BTreeMap<usize, (u32, Rigid)>,
+    cameras: BTreeMap<usize, Revision>,
 }
 
 impl Told {
@@ -68,19 +70,30 @@ impl Told {
         let mut out = SparseBatch::default();
         for (shot_ix, shot) in scene.shots.iter().enumerate() {
             let Some(placed) = &shot.placed else { continue };
-            let here = (placed.component, placed.cam_from_map.inverse());
-            let before = self.poses.insert(shot_ix, here);
+            let keyframe_id = shot.keyframe.id;
+            let Some(intrinsics) = scene.intrinsics_of(keyframe_id) else {
+                continue;
+            };
+            let here = Revision {
+                keyframe_id,
+                component: placed.component,
+                intrinsics,
+                batch_from_cam: placed.cam_from_map.inverse(),
+            };
+            let before = self.cameras.insert(shot_ix, here);
             if before.is_none() || again.contains(&shot_ix) {
                 out.views.extend(view(scene, shot_ix));
             } else if let Some(before) = before {
-                let moved = before.0 != here.0
-                    || before.1.angle_to(&here.1) > MOVED
-                    || before.1.translation.distance(here.1.translation) > MOVED;
+                let (old, new) = (before.batch_from_cam, here.batch_from_cam);
+                let moved = before.component != here.component
+                    || old.angle_to(&new) > MOVED
+                    || old.translation.distance(new.translation) > MOVED
+                    || (before.intrinsics.fx / intrinsics.fx - 1.0).abs() > MOVED;
                 if moved {
-                    out.revised.push((shot.keyframe.id, here.0, here.1));
+                    out.revised.push(here);
                 } else {
                     // Small moves add up: compare with what was told.
-                    self.poses.insert(shot_ix, before);
+                    self.cameras.insert(shot_ix, before);
                 }
             }
         }
@@ -145,6 +158,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
         errors.extend(scene.sight(at).map(|s| s.error_px(point_in_batch)));
         landmarks.push(Sighting {
             point_in_batch,
+            landmark,
             pixel: scene.pixel(at) * to_picture,
         });
     }

@@ -109,6 +109,7 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
             intrinsics,
             truth: None,
             truth_depth: None,
+            is_held_out: false,
         };
         sfm.push(
             &Arc::new(Keyframe {
@@ -295,6 +296,7 @@ fn blank_tiny_and_broken_pictures_are_survived() {
             intrinsics: None,
             truth: None,
             truth_depth: None,
+            is_held_out: false,
         };
         Arc::new(Keyframe {
             id,

@@ -33,6 +33,7 @@ use std::sync::Arc;
 use crate::camera::{Intrinsics, Lens};
 use crate::config::SourceParams;
 use crate::frame::Frame;
+use crate::pose::extent;
 
 use super::rectify::Rectifier;
 use super::{Source, SourceCounts, SourceError};
@@ -212,6 +213,7 @@ impl Source for SyntheticSource {
             intrinsics,
             truth: Some(self.take.pose(ix)),
             truth_depth: intrinsics.map(|i| Arc::new(self.take.depth(ix, &halved(i)))),
+            is_held_out: false,
         })
     }
 
@@ -224,5 +226,12 @@ impl Source for SyntheticSource {
 
     fn len_hint(&self) -> Option<u64> {
         Some(u64::from(self.n_frames - self.next_ix))
+    }
+
+    fn truth_extent(&self) -> Option<f64> {
+        let centres: Vec<_> = (0..self.n_frames)
+            .map(|ix| self.take.pose(ix).translation)
+            .collect();
+        Some(extent(&centres))
     }
 }

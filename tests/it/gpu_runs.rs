@@ -1,0 +1,97 @@
+//! The whole program on a GPU, which may be software: it maps, twice the same, and says when there is none.
+
+use std::cell::RefCell;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+use splat_mapper::gpu::device::Wanted;
+use splat_mapper::splat::gradients::Gradients;
+use splat_mapper::splat::wgpu::{self, WgpuEngine};
+use splat_mapper::splat::{Splats, StepSettings, TrainingView};
+
+const DEMO: &str = "recordings/demo.mcap";
+
+/// On lavapipe where there is no GPU; `scripts/setup test` installs it.
+pub fn gpu_engine(subgroups: bool) -> WgpuEngine {
+    let wanted = Wanted {
+        any_kind: true,
+        subgroups,
+    };
+    WgpuEngine::new(wanted).unwrap_or_else(|error| panic!("run scripts/setup test: {error}"))
+}
+
+pub fn gpu_gradients(
+    subgroups: bool,
+    splats: &Splats,
+    view: &TrainingView,
+    settings: &StepSettings,
+) -> Gradients {
+    thread_local! {
+        // Opening a device compiles all shaders.
+        static ENGINES: RefCell<[Option<WgpuEngine>; 2]> = const { RefCell::new([None, None]) };
+    }
+    ENGINES.with_borrow_mut(|engines| {
+        let engine = engines[usize::from(subgroups)].get_or_insert_with(|| gpu_engine(subgroups));
+        wgpu::gradients(engine, splats, view, [[0.0; 3]; 2], settings).unwrap()
+    })
+}
+
+/// A small replay; its report and what it said last.
+fn replay(out: &Path, drivers: Option<&str>) -> (Option<i32>, Option<Value>, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splat-mapper"));
+    command.args(["replay", DEMO, "--backend", "wgpu", "--geometry", "known"]);
+    command.args([
+        "--max-side",
+        "96",
+        "--steps",
+        "40",
+        "--set",
+        "map.mcmc=true",
+    ]);
+    command.args([
+        "--set",
+        "source.max_frames=12",
+        "--set",
+        "map.mcmc_every=20",
+    ]);
+    command.arg("--out").arg(out);
+    if let Some(drivers) = drivers {
+        command.env("VK_DRIVER_FILES", drivers);
+        command.env("VK_ICD_FILENAMES", drivers);
+    }
+    let output = command.output().unwrap();
+    let report = std::fs::read(out.join("report.json")).ok();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    (
+        output.status.code(),
+        report.and_then(|text| serde_json::from_slice(&text).ok()),
+        stderr.lines().last().unwrap_or_default().to_owned(),
+    )
+}
+
+#[test]
+fn a_replay_on_a_gpu_gives_the_same_map_twice() {
+    let reports = [0, 1].map(|_| {
+        let out = tempfile::tempdir().unwrap();
+        let (code, report, line) = replay(out.path(), None);
+        assert_eq!(code, Some(0), "{line}");
+        report.unwrap()
+    });
+    let [first, second] = &reports;
+    assert!(first["adapter"].as_str().unwrap().starts_with("wgpu"));
+    assert!(first["splats"].as_u64().unwrap() > 100);
+    assert!(first["peak_gpu_mib"].as_f64().unwrap() > 1.0);
+    assert_eq!(first["map_sha256"], second["map_sha256"]);
+}
+
+#[test]
+fn without_a_driver_one_line_says_what_to_install() {
+    let out = tempfile::tempdir().unwrap();
+    let (code, _, line) = replay(out.path(), Some("/nowhere.json"));
+    assert_eq!(code, Some(1), "{line}");
+    assert!(
+        line.contains("no GPU adapter answers") && line.contains("--backend cpu"),
+        "{line}"
+    );
+}

@@ -1,0 +1,189 @@
+//! LPIPS by a network that the user supplies: the way through ONNX Runtime, with a network small enough to write here.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use splat_mapper::eval::lpips::Lpips;
+use splat_mapper::frame::RgbImage;
+
+const ROOM: &str = "synthetic:room?frames=12&width=96&height=72&speed=3";
+/// ONNX: type number of f32 tensors, and of integer attributes.
+const FLOAT: u64 = 1;
+const INT: u64 = 2;
+
+/// The library that scripts/setup test put into target/onnxruntime, or the one that is named. Without it: fails under
+/// CI=true, else says so, and the test returns.
+fn library() -> Option<PathBuf> {
+    let named = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
+    let folder = Path::new("target/onnxruntime/onnxruntime/capi");
+    let is_library = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        name.starts_with("libonnxruntime.so")
+    };
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let installed = entries.map(|entry| entry.path()).find(is_library);
+    let found = named
+        .or(installed)
+        .and_then(|path| path.canonicalize().ok());
+    if found.is_none() {
+        let reason = "no ONNX Runtime in target/onnxruntime; run scripts/setup test";
+        assert!(std::env::var("CI").as_deref() != Ok("true"), "{reason}");
+        eprintln!("ignored: {reason}");
+    }
+    found
+}
+
+/// Protobuf: a number, and bytes, under a field.
+fn number(field: u64, value: u64) -> Vec<u8> {
+    [varint(field << 3), varint(value)].concat()
+}
+
+fn bytes(field: u64, content: &[u8]) -> Vec<u8> {
+    [
+        &varint(field << 3 | 2),
+        &varint(content.len() as u64),
+        content,
+    ]
+    .concat()
+}
+
+fn varint(mut value: u64) -> Vec<u8> {
+    let mut out = Vec::new();
+    while value >= 128 {
+        out.push((value % 128) as u8 | 128);
+        value /= 128;
+    }
+    out.push(value as u8);
+    out
+}
+
+fn node(op: &str, inputs: &[&str], output: &str, attributes: &[u8]) -> Vec<u8> {
+    let mut content: Vec<u8> = inputs.iter().flat_map(|i| bytes(1, i.as_bytes())).collect();
+    content.extend(bytes(2, output.as_bytes()));
+    content.extend(bytes(4, op.as_bytes()));
+    content.extend(attributes);
+    bytes(1, &content)
+}
+
+/// A named f32 tensor; sides that are words are free.
+fn tensor(field: u64, name: &str, sides: &[&str]) -> Vec<u8> {
+    let side = |side: &&str| match side.parse() {
+        Ok(n) => bytes(1, &number(1, n)),
+        Err(_) => bytes(1, &bytes(2, side.as_bytes())),
+    };
+    let shape: Vec<u8> = sides.iter().flat_map(side).collect();
+    let of_type = bytes(1, &[number(1, FLOAT), bytes(2, &shape)].concat());
+    bytes(
+        field,
+        &[bytes(1, name.as_bytes()), bytes(2, &of_type)].concat(),
+    )
+}
+
+/// Mean of |a - b| over `inputs` pictures named a, b, ...: with one input, of |a|.
+fn network(inputs: &[&str]) -> Vec<u8> {
+    let keep_no_sides = [bytes(1, b"keepdims"), number(3, 0), number(20, INT)].concat();
+    let mut graph = match inputs {
+        [one] => node("Abs", &[one], "size", &[]),
+        _ => [
+            node("Sub", &inputs[..2], "difference", &[]),
+            node("Abs", &["difference"], "size", &[]),
+        ]
+        .concat(),
+    };
+    graph.extend(node(
+        "ReduceMean",
+        &["size"],
+        "mean",
+        &bytes(5, &keep_no_sides),
+    ));
+    graph.extend(bytes(2, b"mean_difference"));
+    for name in inputs {
+        graph.extend(tensor(11, name, &["1", "3", "H", "W"]));
+    }
+    graph.extend(tensor(12, "mean", &[]));
+    let opset = [bytes(1, b""), number(2, 13)].concat();
+    [number(1, 8), bytes(7, &graph), bytes(8, &opset)].concat()
+}
+
+fn saved(folder: &Path, content: &[u8]) -> PathBuf {
+    let path = folder.join("lpips.onnx");
+    std::fs::write(&path, content).unwrap();
+    path
+}
+
+#[test]
+fn a_network_of_two_pictures_gives_their_distance() {
+    let Some(library) = library() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let model = saved(folder.path(), &network(&["shown", "seen"]));
+    let mut lpips = Lpips::open(&library, &model).unwrap();
+    let photo = RgbImage {
+        width_px: 5,
+        height_px: 4,
+        pixels: [255, 0, 51].repeat(20),
+    };
+    let rendered: Vec<f32> = [1.0, 0.5, 0.0].repeat(20);
+    // Doubled by the range from -1 to 1: 0, 1.0 and 0.4.
+    let distance = lpips.distance(&rendered, &photo).unwrap();
+    assert!((distance - 1.4 / 3.0).abs() < 1e-6, "{distance}");
+    let same: Vec<f32> = photo.pixels.iter().map(|v| f32::from(*v) / 255.0).collect();
+    assert!(lpips.distance(&same, &photo).unwrap() < 1e-6);
+    let one = saved(folder.path(), &network(&["shown"]));
+    let error = Lpips::open(&library, &one).unwrap_err().to_string();
+    assert!(error.contains("1 inputs, expected two"), "{error}");
+    let broken = saved(folder.path(), b"no protobuf at all");
+    let error = Lpips::open(&library, &broken).unwrap_err().to_string();
+    assert!(
+        error.contains("docs/FORMATS.md") && error.lines().count() == 1,
+        "{error}"
+    );
+}
+
+fn replay(model: &str, library: Option<&Path>, out: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splat-mapper"));
+    let model = format!("eval.lpips_model={model}");
+    command
+        .args([
+            "replay",
+            ROOM,
+            "--geometry",
+            "known",
+            "--steps",
+            "20",
+            "--set",
+            &model,
+        ])
+        .args(["--holdout", "4", "--out", out.to_str().unwrap()])
+        .env(
+            "ORT_DYLIB_PATH",
+            library.unwrap_or(Path::new("/nonexistent")),
+        );
+    command.output().unwrap()
+}
+
+#[test]
+fn a_run_reports_lpips_of_its_held_out_views() {
+    let Some(library) = library() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let model = saved(folder.path(), &network(&["a", "b"]));
+    let output = replay(model.to_str().unwrap(), Some(&library), folder.path());
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let report = std::fs::read(folder.path().join("report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
+    let distance = report["quality"]["lpips_holdout"].as_f64().unwrap();
+    assert!(distance > 0.0 && distance < 1.0, "{distance}");
+}
+
+#[test]
+fn without_the_library_the_error_says_how_to_get_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = replay("any.onnx", None, folder.path());
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(text.contains("pip install onnxruntime"), "{text}");
+    assert!(text.contains("ORT_DYLIB_PATH"), "{text}");
+}
