@@ -17,8 +17,8 @@ const FINAL_POSE_RATE: f32 = 0.03;
 const FINAL_DEPTH_WEIGHT: f32 = 0.1;
 /// Between arrivals poses move slowly: splats that have just been seeded would pull them about.
 const STREAMING_POSE_RATE: f32 = 0.2;
-/// First pose rate as a share of the standard deviation that the model states: some ten steps of a view cover it.
-const RATE_OF_ERROR: f32 = 0.3;
+/// First pose rate as a share of the standard deviation that the model states: a few steps of a view cover it.
+const RATE_OF_ERROR: f32 = 0.5;
 /// Bands above the base colour wait until the geometry has settled (3DGS trains them late).
 const SH_START: f32 = 0.3;
 /// Rate of the SH bands above the base, as a share of the base rate (3DGS).
