@@ -32,12 +32,6 @@ fn main() {
     camera.n_instances = n;
     n_instances[0] = n;
     table_length[0] = DIGITS * ((n + SORT_BLOCK - 1u) / SORT_BLOCK);
-    let over_instances = groups_for(n, 256u);
-    args[ARGS_INSTANCES] = over_instances.x;
-    args[ARGS_INSTANCES + 1u] = over_instances.y;
-    args[ARGS_INSTANCES + 2u] = 1u;
-    let over_blocks = groups_for(n, SORT_BLOCK);
-    args[ARGS_SORT_INSTANCES] = over_blocks.x;
-    args[ARGS_SORT_INSTANCES + 1u] = over_blocks.y;
-    args[ARGS_SORT_INSTANCES + 2u] = 1u;
+    write_args(ARGS_INSTANCES, n, 256u);
+    write_args(ARGS_SORT_INSTANCES, n, SORT_BLOCK);
 }

@@ -109,15 +109,15 @@ fn move_directly(record: u32) {
     }
     // Series of the exponential to the fourth power of an angle that is a small fraction of a radian.
     let squared = dot(theta, theta);
+    let increment = normalize(vec4<f32>(1.0 - squared / 8.0 + squared * squared / 384.0, theta * (0.5 - squared / 48.0)));
     let turn = quat_product(
-        normalize(vec4<f32>(1.0 - squared / 8.0 + squared * squared / 384.0, theta * (0.5 - squared / 48.0))),
+        increment,
         vec4<f32>(views[record], views[record + 1u], views[record + 2u], views[record + 3u]),
     );
     let once = cross(theta, rho);
     let shift = rho + (0.5 - squared / 24.0) * once + (1.0 / 6.0 - squared / 120.0) * cross(theta, once);
     let t = record + VIEW_TRANSLATION;
-    let rotated = rotation_of(normalize(vec4<f32>(1.0 - squared / 8.0 + squared * squared / 384.0, theta * (0.5 - squared / 48.0))))
-        * vec3<f32>(views[t], views[t + 1u], views[t + 2u]);
+    let rotated = rotation_of(increment) * vec3<f32>(views[t], views[t + 1u], views[t + 2u]);
     let unit = normalize(turn);
     for (var i = 0u; i < 4u; i += 1u) {
         views[record + VIEW_QUAT + i] = unit[i];

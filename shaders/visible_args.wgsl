@@ -20,12 +20,6 @@ fn main() {
     camera.n_visible = n;
     n_visible[0] = n;
     table_length[0] = DIGITS * ((n + SORT_BLOCK - 1u) / SORT_BLOCK);
-    let over_visible = groups_for(n, 256u);
-    args[ARGS_VISIBLE] = over_visible.x;
-    args[ARGS_VISIBLE + 1u] = over_visible.y;
-    args[ARGS_VISIBLE + 2u] = 1u;
-    let over_blocks = groups_for(n, SORT_BLOCK);
-    args[ARGS_SORT_VISIBLE] = over_blocks.x;
-    args[ARGS_SORT_VISIBLE + 1u] = over_blocks.y;
-    args[ARGS_SORT_VISIBLE + 2u] = 1u;
+    write_args(ARGS_VISIBLE, n, 256u);
+    write_args(ARGS_SORT_VISIBLE, n, SORT_BLOCK);
 }

@@ -75,6 +75,14 @@ impl DepthMap {
         }
     }
 
+    /// Depth and confidence of pixel `at`; `None` where no depth was verified.
+    pub fn verified(&self, at: usize) -> Option<(f32, f32)> {
+        let (depth, confidence) = (*self.depth.get(at)?, *self.confidence.get(at)?);
+        let is_verified =
+            depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
+        is_verified.then_some((depth, confidence))
+    }
+
     /// Median of the verified depths; `None` where there are none.
     pub fn median(&self) -> Option<f32> {
         let usable = self

@@ -6,8 +6,10 @@ const ARGS_INSTANCES: u32 = 8u;
 const ARGS_SORT_INSTANCES: u32 = 12u;
 const MAX_GROUPS_X: u32 = 65535u;
 
-fn groups_for(n: u32, per_group: u32) -> vec2<u32> {
+// Writes the size of a dispatch over n items to `args`.
+fn write_args(at: u32, n: u32, per_group: u32) {
     let groups = (n + per_group - 1u) / per_group;
-    let rows = (groups + MAX_GROUPS_X - 1u) / MAX_GROUPS_X;
-    return vec2<u32>(min(groups, MAX_GROUPS_X), rows);
+    args[at] = min(groups, MAX_GROUPS_X);
+    args[at + 1u] = (groups + MAX_GROUPS_X - 1u) / MAX_GROUPS_X;
+    args[at + 2u] = 1u;
 }

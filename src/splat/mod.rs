@@ -234,6 +234,27 @@ pub trait Engine: Send {
     -> Rendering;
 }
 
+impl TrainingView {
+    /// Our own mistake when it fails.
+    pub(crate) fn assert_consistent(&self) {
+        let (image, intrinsics) = (&self.image, &self.intrinsics);
+        let size = (image.width_px, image.height_px);
+        assert_eq!(
+            size,
+            (intrinsics.width_px, intrinsics.height_px),
+            "a view's intrinsics are those of its image"
+        );
+        let n_pixels = size.0 as usize * size.1 as usize;
+        assert_eq!(
+            image.pixels.len(),
+            3 * n_pixels,
+            "an image is as large as it says"
+        );
+        let is_fit = self.mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
+        assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");
+    }
+}
+
 impl Splats {
     pub fn len(&self) -> usize {
         self.means.len()

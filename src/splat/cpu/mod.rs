@@ -217,18 +217,6 @@ impl Engine for CpuEngine {
     }
 
     fn add_view(&mut self, view: TrainingView) -> usize {
-        let (image, intrinsics) = (&view.image, &view.intrinsics);
-        let size = (image.width_px, image.height_px);
-        assert_eq!(
-            size,
-            (intrinsics.width_px, intrinsics.height_px),
-            "a view's intrinsics are those of its image"
-        );
-        assert_eq!(
-            image.pixels.len(),
-            3 * size.0 as usize * size.1 as usize,
-            "an image is as large as it says"
-        );
         self.views.push(View::new(view, self.refiner.as_ref()));
         self.views.len() - 1
     }
@@ -239,13 +227,8 @@ impl Engine for CpuEngine {
 
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {
         let view = self.views[view_ix].training_mut();
-        let size = (view.image.width_px, view.image.height_px);
-        assert_eq!(
-            size,
-            (intrinsics.width_px, intrinsics.height_px),
-            "a view's intrinsics are those of its image"
-        );
         view.intrinsics = *intrinsics;
+        view.assert_consistent();
     }
 
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {

@@ -34,7 +34,7 @@ impl View {
             exposure: Exposure::default(),
             exposure_adam: ExposureAdam::default(),
         };
-        assert_mask_fits(&new.training);
+        new.training.assert_consistent();
         new.set_pose(new.training.cam_from_map, refiner);
         new
     }
@@ -108,7 +108,7 @@ impl View {
 
     pub(super) fn set_mask(&mut self, mask: Option<Arc<[u8]>>) {
         self.training.mask = mask;
-        assert_mask_fits(&self.training);
+        self.training.assert_consistent();
     }
 
     fn move_to(&mut self, cam_from_map: Rigid, refiner: Option<&Refiner>) {
@@ -120,10 +120,4 @@ impl View {
             }
         };
     }
-}
-
-fn assert_mask_fits(view: &TrainingView) {
-    let n_pixels = view.image.pixels.len() / 3;
-    let is_fit = view.mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
-    assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");
 }

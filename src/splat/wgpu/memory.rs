@@ -91,7 +91,7 @@ impl SplatMemory {
 
     /// Writes splats behind the last. There must be room.
     pub(super) fn append(&mut self, gpu: &Gpu, splats: &Splats, now: u32) {
-        self.write(gpu, self.n, splats, 0.0, now);
+        self.write(gpu, self.n, splats, now);
         let zeros = vec![0.0_f32; MOMENTS.max(n_sh_moments(self.sh_degree)) * splats.len()];
         gpu.write(
             &self.moments,
@@ -110,7 +110,7 @@ impl SplatMemory {
     /// Overwrites the parameters of all, optimiser state and ages stay.
     pub(super) fn overwrite(&mut self, gpu: &Gpu, splats: &Splats) -> Result<(), GpuError> {
         let old: Vec<f32> = gpu.read(&self.geometry, 0..self.n * GEOMETRY)?;
-        let mut rows = geometry_rows(splats, 0.0, 0);
+        let mut rows = geometry_rows(splats, 0);
         for (row, old) in rows
             .chunks_exact_mut(GEOMETRY)
             .zip(old.chunks_exact(GEOMETRY))
@@ -183,11 +183,11 @@ impl SplatMemory {
         Ok([geometry, rest])
     }
 
-    fn write(&self, gpu: &Gpu, first: usize, splats: &Splats, age: f32, now: u32) {
+    fn write(&self, gpu: &Gpu, first: usize, splats: &Splats, now: u32) {
         gpu.write(
             &self.geometry,
             first * GEOMETRY,
-            &geometry_rows(splats, age, now),
+            &geometry_rows(splats, now),
         );
         let width = n_sh_rest(self.sh_degree);
         gpu.write(&self.sh_rest, first * width, &sh_rest_rows(splats));
@@ -217,7 +217,7 @@ impl SplatMemory {
     }
 }
 
-fn geometry_rows(splats: &Splats, age: f32, now: u32) -> Vec<f32> {
+fn geometry_rows(splats: &Splats, now: u32) -> Vec<f32> {
     let stride = splats.sh_stride();
     let mut rows = Vec::with_capacity(GEOMETRY * splats.len());
     for i in 0..splats.len() {
@@ -225,7 +225,8 @@ fn geometry_rows(splats: &Splats, age: f32, now: u32) -> Vec<f32> {
         rows.push(splats.opacity_logits[i]);
         rows.extend(splats.quats[i]);
         rows.extend(splats.log_scales[i]);
-        rows.push(age);
+        // Updates since its moments were 0.
+        rows.push(0.0);
         rows.extend_from_slice(&splats.sh[i * stride..i * stride + 3]);
         rows.push(now as f32);
     }

@@ -79,6 +79,7 @@ impl WgpuEngine {
     }
 
     fn try_append(&mut self, splats: &Splats) -> Result<(), GpuError> {
+        splats.assert_consistent();
         self.confirm()?;
         if self.memory.n == 0 && self.memory.sh_degree != splats.sh_degree {
             self.memory = SplatMemory::new(&self.gpu, splats.sh_degree)?;
@@ -203,13 +204,7 @@ impl Engine for WgpuEngine {
     }
 
     fn add_view(&mut self, view: TrainingView) -> usize {
-        let (image, intrinsics) = (&view.image, &view.intrinsics);
-        let size = (image.width_px, image.height_px);
-        assert_eq!(
-            size,
-            (intrinsics.width_px, intrinsics.height_px),
-            "a view's intrinsics are those of its image"
-        );
+        view.assert_consistent();
         let result = self
             .confirm()
             .and_then(|()| self.views.add(&self.gpu, view));
@@ -226,7 +221,9 @@ impl Engine for WgpuEngine {
 
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {
         let result = self.confirm();
-        self.views.all[view_ix].training.intrinsics = *intrinsics;
+        let training = &mut self.views.all[view_ix].training;
+        training.intrinsics = *intrinsics;
+        training.assert_consistent();
         self.views.write_camera(&self.gpu, view_ix, intrinsics);
         self.note(result);
     }
@@ -250,7 +247,9 @@ impl Engine for WgpuEngine {
     fn set_mask(&mut self, view_ix: usize, mask: Option<Arc<[u8]>>) {
         let result = self.confirm().and_then(|()| {
             let view = &mut self.views.all[view_ix];
-            views::set_mask(view, &self.gpu, mask)
+            view.training.mask = mask;
+            view.training.assert_consistent();
+            view.upload(&self.gpu)
         });
         self.note(result);
     }

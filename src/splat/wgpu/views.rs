@@ -1,7 +1,5 @@
 //! The views on the GPU: a record of pose, camera and exposure each, the picture that is wanted, and the shared network.
 
-use std::sync::Arc;
-
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::camera::Intrinsics;
@@ -239,16 +237,10 @@ fn wanted(view: &TrainingView) -> Vec<u32> {
         })
         .collect();
     if let Some(depth) = view.depth.as_deref().filter(|depth| is_whole(depth)) {
-        let both = depth.depth.iter().zip(&depth.confidence);
-        words.extend(both.flat_map(|(depth, confidence)| {
-            let is_usable =
-                *depth > 0.0 && depth.is_finite() && *confidence > 0.0 && confidence.is_finite();
-            let pair = if is_usable {
-                [*depth, *confidence]
-            } else {
-                [0.0; 2]
-            };
-            pair.map(f32::to_bits)
+        let n = depth.width_px as usize * depth.height_px as usize;
+        words.extend((0..n).flat_map(|at| {
+            let (depth, confidence) = depth.verified(at).unwrap_or_default();
+            [depth, confidence].map(f32::to_bits)
         }));
     }
     words
@@ -276,10 +268,7 @@ fn confidence_sum(view: &TrainingView) -> f32 {
         let row = (2 * y + 1) * map_height / (2 * height) * map_width;
         for x in 0..width {
             let at = row + (2 * x + 1) * map_width / (2 * width);
-            let (depth, confidence) = (depth.depth[at], depth.confidence[at]);
-            let is_usable =
-                depth > 0.0 && depth.is_finite() && confidence > 0.0 && confidence.is_finite();
-            if is_usable {
+            if let Some((_, confidence)) = depth.verified(at) {
                 let weight = view
                     .mask
                     .as_ref()
@@ -343,17 +332,4 @@ pub(super) fn camera_of(
         gain: [1.0; 4],
         ..crate::gpu::types::Camera::default()
     }
-}
-
-/// The picture's own weights, replaced.
-pub(super) fn set_mask(
-    view: &mut View,
-    gpu: &Gpu,
-    mask: Option<Arc<[u8]>>,
-) -> Result<(), GpuError> {
-    let n_pixels = view.training.image.pixels.len() / 3;
-    let is_fit = mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
-    assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");
-    view.training.mask = mask;
-    view.upload(gpu)
 }
