@@ -15,13 +15,16 @@ use crate::splat::RefinerSettings;
 
 /// Steps between looks at the poses.
 pub(super) const GAUGE_EVERY: u64 = 250;
-/// Common motion that is left alone, in radians and as a share of the spread of the cameras: moving all poses back
-/// makes their optimisers start again, which costs more.
+/// Common motion that is left alone, in radians and as a share of the spread of the cameras: moving back takes all
+/// splats from the engine and returns them.
 const MIN_DRIFT: f64 = 1e-3;
 /// A view that has left the model's pose by more has jumped (3R-GS poses stay within a fraction of it).
 const MAX_TURN_RAD: f64 = 5.0 * std::f64::consts::PI / 180.0;
 /// The same for its place, as a share of the spread of the cameras.
 const MAX_SHIFT: f64 = 0.1;
+/// Both are at least so many standard deviations of what the model states of its poses: each of three axes may be
+/// off by several, and all may have an offset in common.
+const MAX_ERRORS: f64 = 6.0;
 /// The network starts again when the cameras have spread by this factor: its outputs would have become too small.
 const RESTART_GROWTH: f64 = 2.0;
 /// Least spread of the cameras as a share of the scene's depth, for a single place.
@@ -64,9 +67,9 @@ impl SplatMap {
         let shift = back.transform_point(self.centre(&map_poses)) - self.centre(&map_poses);
         let drift = (shift.length() / spread).max(back.angle_to(&Rigid::IDENTITY));
         if drift > MIN_DRIFT && back.is_finite() {
-            for (ix, pose) in map_poses.iter_mut().enumerate() {
+            self.engine.move_cameras(&back);
+            for pose in &mut map_poses {
                 *pose = (*pose * back.inverse()).renormalized();
-                self.engine.set_pose(ix, *pose);
             }
             let mut splats = self.engine.splats();
             let carry = Carry::new(back, splats.sh_degree);
@@ -83,6 +86,9 @@ impl SplatMap {
 
     fn put_back_jumps(&mut self, map_poses: &[Rigid], spread: f64) {
         let map_from_model = self.map_from_model(map_poses);
+        let [stated_turn, stated_shift] = self.pose_error.map(f64::from);
+        let max_turn = MAX_TURN_RAD.max(MAX_ERRORS * stated_turn);
+        let max_shift = (MAX_SHIFT * spread).max(MAX_ERRORS * stated_shift);
         for (id, placed) in &self.keyframes.placed {
             let wanted = map_from_model
                 .transform_pose(&placed.model_from_cam)
@@ -90,7 +96,7 @@ impl SplatMap {
             let found = &map_poses[placed.view_ix];
             let shift = (wanted.inverse().translation - found.inverse().translation).length();
             let turn = wanted.angle_to(found);
-            if found.is_finite() && turn <= MAX_TURN_RAD && shift <= MAX_SHIFT * spread {
+            if found.is_finite() && turn <= max_turn && shift <= max_shift {
                 continue;
             }
             self.engine.set_pose(placed.view_ix, wanted);

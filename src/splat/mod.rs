@@ -65,7 +65,7 @@ pub enum PoseStep {
     Held,
     /// The view's own increment of six numbers.
     Direct,
-    /// The network that all views share (3R-GS).
+    /// The network that all views share (3R-GS), and what it leaves by the view's own increment.
     Shared,
 }
 
@@ -185,6 +185,10 @@ pub trait Engine: Send {
     /// Replaces a view's pose and clears its own optimiser state; the shared network stays as it is.
     fn set_pose(&mut self, view_ix: usize, cam_from_map: Rigid);
 
+    /// Moves the frame that all cameras stand in, not the splats: every `cam_from_map` is given its inverse on the right.
+    /// Optimisers go on, since their increments are in the cameras' own axes.
+    fn move_cameras(&mut self, new_from_old: &Rigid);
+
     /// Replaces a view's intrinsics, of the same picture; the factor on all focal lengths stays.
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics);
 
@@ -232,6 +236,14 @@ pub trait Engine: Send {
     /// Renders at the given SH degree, black background.
     fn render(&mut self, intrinsics: &Intrinsics, cam_from_map: &Rigid, sh_degree: u8)
     -> Rendering;
+}
+
+impl StepSettings {
+    /// Whether the view's own increment moves.
+    pub(crate) fn moves_alone(&self) -> bool {
+        let is_on = self.lr_pose_rotation > 0.0 || self.lr_pose_translation > 0.0;
+        self.pose != PoseStep::Held && is_on
+    }
 }
 
 impl TrainingView {

@@ -34,6 +34,7 @@ impl Engine for Ramp {
         0
     }
     fn set_pose(&mut self, _: usize, _: Rigid) {}
+    fn move_cameras(&mut self, _: &Rigid) {}
     fn set_intrinsics(&mut self, _: usize, _: &Intrinsics) {}
     fn set_depth(&mut self, _: usize, _: Option<std::sync::Arc<splat_mapper::frame::DepthMap>>) {}
     fn start_refiner(&mut self, _: &RefinerSettings) {}

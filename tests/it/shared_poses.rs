@@ -26,6 +26,8 @@ fn shared_step() -> StepSettings {
     StepSettings {
         pose: PoseStep::Shared,
         lr_refiner: 2e-3,
+        lr_pose_rotation: 0.0,
+        lr_pose_translation: 0.0,
         train_splats: false,
         ..random::settings()
     }
@@ -111,6 +113,36 @@ fn views_that_come_or_are_moved_stand_where_they_were_asked_to() {
         for (found, wanted) in engine.poses().iter().zip(&poses) {
             assert_same("a fresh network", found, wanted);
         }
+    }
+}
+
+#[test]
+fn a_motion_of_the_map_moves_all_cameras_and_stops_no_optimiser() {
+    for backend in &BACKENDS {
+        let scene = random::scene(13, &ORDINARY);
+        let step = StepSettings {
+            lr_pose_rotation: 1e-3,
+            lr_pose_translation: 1e-3,
+            ..shared_step()
+        };
+        let mut engines = [(backend.engine)(), (backend.engine)()];
+        for engine in &mut engines {
+            engine.append(&scene.splats);
+            engine.add_view(scene.view.clone());
+            engine.start_refiner(&NETWORK);
+            (0..4).for_each(|_| engine.step(0, &step));
+        }
+        let [moved, still] = &mut engines;
+        let motion = Rigid::exp(DVec3::new(0.4, -0.2, 0.1), DVec3::new(0.2, -0.3, 0.1));
+        moved.move_cameras(&motion);
+        let wanted = still.poses()[0] * motion.inverse();
+        assert_same(backend.name, &moved.poses()[0], &wanted);
+        // There and back: had the optimiser begun anew, its next step would be of another length.
+        moved.move_cameras(&motion.inverse());
+        for engine in [&mut *moved, &mut *still] {
+            (0..2).for_each(|_| engine.step(0, &step));
+        }
+        assert_same(backend.name, &moved.poses()[0], &still.poses()[0]);
     }
 }
 
@@ -250,9 +282,6 @@ fn left_over(mut engine: Box<dyn Engine>, settings: &StepSettings, n_steps: usiz
 fn disturbed_poses_come_back_by_joint_optimisation() {
     let joint = StepSettings {
         lr_mean: 5e-4,
-        lr_pose_rotation: 1e-3,
-        lr_pose_translation: 1e-3,
-        lr_refiner: 2e-3,
         depth_weight: 0.0,
         opacity_reg: 0.0,
         scale_reg: 0.0,
@@ -261,19 +290,31 @@ fn disturbed_poses_come_back_by_joint_optimisation() {
     };
     // 4,000 steps are too many for software Vulkan; that its steps are the same, the tests above say.
     for backend in &BACKENDS[..1] {
-        for pose in [PoseStep::Direct, PoseStep::Shared] {
+        for (name, own_rate, lr_refiner, most) in [
+            ("own increments", 1e-3, 0.0, 0.2),
+            // The rate is that of 3R-GS.
+            ("network and own increments", 1e-3, 1.5e-4, 0.2),
+            ("network", 0.0, 2e-3, 0.4),
+        ] {
             let settings = StepSettings {
-                pose,
+                pose: if lr_refiner > 0.0 {
+                    PoseStep::Shared
+                } else {
+                    PoseStep::Direct
+                },
+                lr_pose_rotation: own_rate,
+                lr_pose_translation: own_rate,
+                lr_refiner,
                 ..joint.clone()
             };
             let (ate, rotation) = left_over((backend.engine)(), &settings, 2000);
             eprintln!(
-                "{} {pose:?}: {ate:.3} of the ATE, {rotation:.3} of the angle are left",
+                "{} {name}: {ate:.3} of the ATE, {rotation:.3} of the angle are left",
                 backend.name
             );
             assert!(
-                ate < 0.4 && rotation < 0.4,
-                "{} {pose:?}: {ate:.3}, {rotation:.3}",
+                ate < most && rotation < most,
+                "{} {name}: {ate:.3}, {rotation:.3}",
                 backend.name
             );
         }

@@ -130,13 +130,14 @@ impl CpuEngine {
                 .for_each(|(g, v)| *g += weight * v);
         }
         let view = &mut self.views[view_ix];
-        let is_updated = match (settings.pose, &mut self.refiner) {
-            (PoseStep::Direct, refiner) => view.step_alone(refiner.as_ref(), gradient, settings),
-            (PoseStep::Shared, Some(refiner)) => {
-                view.step_shared(refiner, gradient, settings.lr_refiner)
-            }
-            (PoseStep::Shared, None) | (PoseStep::Held, _) => true,
-        };
+        // Both parts answer to the gradient at the pose that was seen.
+        let mut is_updated = true;
+        if settings.moves_alone() {
+            is_updated = view.step_alone(self.refiner.as_ref(), gradient, settings);
+        }
+        if let (PoseStep::Shared, Some(refiner)) = (settings.pose, &mut self.refiner) {
+            is_updated &= view.step_shared(refiner, gradient, settings.lr_refiner);
+        }
         let mut n_skipped = usize::from(!is_updated);
         if settings.lr_focal > 0.0 {
             match self.focal_adam.direction([self.pass.gradients.log_focal]) {
@@ -223,6 +224,14 @@ impl Engine for CpuEngine {
 
     fn set_pose(&mut self, view_ix: usize, cam_from_map: Rigid) {
         self.views[view_ix].set_pose(cam_from_map, self.refiner.as_ref());
+    }
+
+    fn move_cameras(&mut self, new_from_old: &Rigid) {
+        let old_from_new = new_from_old.inverse();
+        for view in &mut self.views {
+            let base = &mut view.training_mut().cam_from_map;
+            *base = (*base * old_from_new).renormalized();
+        }
     }
 
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {

@@ -67,7 +67,7 @@ impl View {
         self.moments = Moments::default();
     }
 
-    /// The picture and what guides the loss, but no pose.
+    /// The picture, what guides the loss, and the base pose.
     pub(super) fn training_mut(&mut self) -> &mut TrainingView {
         &mut self.training
     }

@@ -219,6 +219,13 @@ impl Engine for WgpuEngine {
         self.note(result);
     }
 
+    fn move_cameras(&mut self, new_from_old: &Rigid) {
+        let result = self
+            .confirm()
+            .and_then(|()| self.views.move_cameras(&self.gpu, new_from_old));
+        self.note(result);
+    }
+
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {
         let result = self.confirm();
         let training = &mut self.views.all[view_ix].training;

@@ -142,7 +142,7 @@ impl WgpuEngine {
             depth_width > 0 && s.depth_weight > 0.0 && s.depth_mode == DepthMode::InverseDepth;
         let flag = |is_set: bool, flag: u32| if is_set { flag } else { 0 };
         let flags = flag(s.train_splats, FLAG_TRAIN_SPLATS)
-            | flag(s.pose == PoseStep::Direct, FLAG_POSE_DIRECT)
+            | flag(s.moves_alone(), FLAG_POSE_DIRECT)
             | flag(s.pose == PoseStep::Shared, FLAG_POSE_SHARED)
             | flag(has_depth, FLAG_DEPTH)
             | flag(self.views.refiner.is_some(), FLAG_REFINER);

@@ -107,24 +107,42 @@ impl Views {
 
     /// Refined poses: base and network together.
     pub(super) fn poses(&self, gpu: &Gpu) -> Result<Vec<Rigid>, GpuError> {
+        let (records, bases) = self.bases(gpu)?;
+        let Some(refiner) = self.network(gpu)? else {
+            return Ok(bases);
+        };
+        let pose = |(record, base): (&[f32], &Rigid)| {
+            let embedding = embedding_of(&record[VIEW_EMBEDDING..][..WIDTH]);
+            refiner.apply(base, &embedding)
+        };
+        let records = records.chunks_exact(VIEW_STRIDE);
+        Ok(records.zip(&bases).map(pose).collect())
+    }
+
+    /// All records, and the poses before the network that they hold.
+    fn bases(&self, gpu: &Gpu) -> Result<(Vec<f32>, Vec<Rigid>), GpuError> {
         let records: Vec<f32> = gpu.read(&self.records, 0..self.all.len() * VIEW_STRIDE)?;
-        let refiner = self.network(gpu)?;
-        let pose = |(record, view): (&[f32], &View)| {
+        let base = |(record, view): (&[f32], &View)| {
             let written = &view.training.cam_from_map;
             // What no step has moved is as exact as it was given.
-            let is_written = record[VIEW_QUAT..VIEW_QUAT + 7] == numbers_of(written);
-            let base = if is_written {
+            if record[VIEW_QUAT..VIEW_QUAT + 7] == numbers_of(written) {
                 *written
             } else {
                 base_of(record)
-            };
-            let embedding = embedding_of(&record[VIEW_EMBEDDING..][..WIDTH]);
-            refiner
-                .as_ref()
-                .map_or(base, |refiner| refiner.apply(&base, &embedding))
+            }
         };
-        let records = records.chunks_exact(VIEW_STRIDE);
-        Ok(records.zip(&self.all).map(pose).collect())
+        let by_view = records.chunks_exact(VIEW_STRIDE).zip(&self.all);
+        let bases = by_view.map(base).collect();
+        Ok((records, bases))
+    }
+
+    /// A motion of the map acts on the bases as on the poses: the network's motion stands left of both.
+    pub(super) fn move_cameras(&mut self, gpu: &Gpu, new_from_old: &Rigid) -> Result<(), GpuError> {
+        let old_from_new = new_from_old.inverse();
+        for (ix, base) in self.bases(gpu)?.1.into_iter().enumerate() {
+            self.write_base(gpu, ix, &(base * old_from_new).renormalized());
+        }
+        Ok(())
     }
 
     /// What the old network did stays in the bases; a new one starts.
