@@ -1,13 +1,8 @@
 // raster_backward: gradients of the pixels -> gradient of each instance's 2D Gaussian.
-// After photo_gradient. One workgroup per tile, which walks near to far as `raster` did: nothing of the way there is kept.
-// Each instance has its own slot: no atomics, and sums in a fixed order. Equations: docs/GRADIENTS.md, raster_backward.
+// After photo_gradient. One workgroup per tile. Each instance has its own slot: no atomics, and sums in a fixed order.
+// Equations: docs/GRADIENTS.md, raster_backward.
 
-#import step
-#import camera
-#import shape
-#import projected
-#import blend
-#import lane_sum
+#import tile_backward
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> projected: array<Projected>;
@@ -21,62 +16,20 @@
 // Three vec4 an instance, see `gather`.
 @group(0) @binding(7) var<storage, read_write> slots: array<vec4<f32>>;
 
+fn keep(instance: u32, part: u32, sum: vec4<f32>) {
+    slots[3u * instance + part] = sum;
+}
+
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let tile = flat(group, groups);
     if tile >= step.n_tiles_x * step.n_tiles_y {
         return;
     }
-    let first = vec2<u32>(tile % step.n_tiles_x, tile / step.n_tiles_x) * TILE_PX;
-    let corner = vec2<f32>(first);
-    let range = tile_ranges[tile];
-    let end = range.x + n_used[tile];
-#repeat i PIXELS
-    var t_$i = -1.0;
-    var v_$i = vec4<f32>(0.0);
-    var behind_$i = 0.0;
-    {
-        let at = first + vec2<u32>(pixel_in_tile($iu, lane));
-        if at.x < step.width_px && at.y < step.height_px {
-            let pixel = at.y * step.width_px + at.x;
-            t_$i = 1.0;
-            v_$i = v_picture[pixel];
-            behind_$i = behind_all[pixel];
+    walk_back(tile, lane);
+    for (var k = end_of(tile) + lane; k < tile_ranges[tile].y; k += LANES) {
+        for (var part = 0u; part < 3u; part += 1u) {
+            keep(k, part, vec4<f32>(0.0));
         }
-    }
-#end
-    for (var k = range.x; k < end; k += 1u) {
-        let splat = projected[instances[k]];
-        let ellipse = ellipse_of(splat, corner);
-        let payload = vec4<f32>(splat.red, splat.green, splat.blue, splat.depth);
-        // v_sigma times 1, dx, dy; dx^2, dx dy, dy^2; weight times the pixel's gradient.
-        var moments = vec3<f32>(0.0);
-        var squares = vec3<f32>(0.0);
-        var lights = vec4<f32>(0.0);
-#repeat i PIXELS
-        {
-            let d = ellipse.center - pixel_in_tile($iu, lane);
-            let raw = raw_alpha(ellipse, d);
-            let alpha = min(raw, MAX_ALPHA);
-            let next = t_$i * (1.0 - alpha);
-            let is_over = next <= MIN_TRANSMITTANCE;
-            let weight = select(alpha * t_$i, 0.0, is_over);
-            let worth = dot(payload, v_$i);
-            behind_$i -= weight * worth;
-            let v_alpha = t_$i * worth - behind_$i / (1.0 - alpha);
-            let v_sigma = select(-raw * v_alpha, 0.0, is_over || raw > MAX_ALPHA);
-            lights += weight * v_$i;
-            let v_d = v_sigma * d;
-            moments += vec3<f32>(v_sigma, v_d);
-            squares += vec3<f32>(v_d.x * d.x, v_d.x * d.y, v_d.y * d.y);
-            t_$i = select(next, -abs(t_$i), is_over);
-        }
-#end
-        store_sums(k, lane, vec4<f32>(moments, lights.w), vec4<f32>(squares, 0.0), vec4<f32>(lights.xyz, 0.0));
-    }
-    for (var k = end + lane; k < range.y; k += LANES) {
-        slots[3u * k] = vec4<f32>(0.0);
-        slots[3u * k + 1u] = vec4<f32>(0.0);
-        slots[3u * k + 2u] = vec4<f32>(0.0);
     }
 }

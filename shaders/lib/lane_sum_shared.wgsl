@@ -1,4 +1,4 @@
-// Sums over the lanes of a tile into the slot of an instance, through workgroup memory: for any subgroup size.
+// Sums over the lanes of a tile of an instance's three parts, each kept by the shader's `keep`, through workgroup memory: for any subgroup size.
 
 var<workgroup> lane_values: array<vec4<f32>, 3u * LANES>;
 
@@ -12,7 +12,7 @@ fn store_sums(place: u32, lane: u32, geometry: vec4<f32>, conic: vec4<f32>, colo
         for (var other = 0u; other < LANES; other += 1u) {
             sum += lane_values[lane * LANES + other];
         }
-        slots[3u * place + lane] = sum;
+        keep(place, lane, sum);
     }
     workgroupBarrier();
 }

@@ -70,7 +70,7 @@ pub(super) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
         .into_iter()
         .map(|timed| (timed.stamp, timed.pose))
         .collect();
-    let mut engine = node::engine(backend)?;
+    let mut engine = node::engine(backend, true)?;
     let n = render::render_poses(
         &splats,
         engine.as_mut(),

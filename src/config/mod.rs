@@ -51,6 +51,7 @@ pub enum ConfigError {
 pub struct Params {
     pub seed: u64,
     pub backend: Backend,
+    pub deterministic: bool,
     pub geometry: String,
     pub sequential: bool,
     pub source: SourceParams,

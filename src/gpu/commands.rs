@@ -79,6 +79,10 @@ impl<'a> Commands<'a> {
         Ok(())
     }
 
+    pub fn gpu(&self) -> &'a Gpu {
+        self.gpu
+    }
+
     /// Zeroes a buffer.
     pub fn clear(&mut self, buffer: &Buffer) {
         self.pass = None;

@@ -27,6 +27,8 @@ pub struct Wanted {
     pub any_kind: bool,
     /// false: behave as on an adapter without subgroup operations, for tests.
     pub subgroups: bool,
+    /// Sums of floats in any order where the adapter can: faster, but not twice the same.
+    pub float_atomics: bool,
 }
 
 /// A device and what is compiled for it. One thread owns it.
@@ -36,6 +38,7 @@ pub struct Gpu {
     name: String,
     limits: wgpu::Limits,
     lanes: Lanes,
+    has_float_atomics: bool,
     pipelines: RefCell<HashMap<&'static str, Arc<Pipeline>>>,
     /// By kernel and buffers.
     pub(super) bind_groups: RefCell<HashMap<(&'static str, Vec<u64>), wgpu::BindGroup>>,
@@ -67,6 +70,11 @@ impl Gpu {
 
     pub fn lanes(&self) -> Lanes {
         self.lanes
+    }
+
+    /// Asked for, and there.
+    pub fn has_float_atomics(&self) -> bool {
+        self.has_float_atomics
     }
 
     pub fn meter(&self) -> &Meter {
@@ -167,13 +175,6 @@ impl Gpu {
             tracing::error!("waiting for {}: {error}", self.name);
             self.hangs()
         })
-    }
-
-    /// Runs callbacks of work that is done, without waiting.
-    pub fn poll(&self) {
-        if let Err(error) = self.device.poll(wgpu::PollType::Poll) {
-            tracing::warn!("polling {}: {error}", self.name);
-        }
     }
 
     /// Buffers were replaced: bindings of the old ones would keep them alive.
@@ -312,11 +313,13 @@ async fn open(wanted: Wanted) -> Result<Gpu, GpuError> {
         })?;
     let info = adapter.get_info();
     let has_subgroups = wanted.subgroups && adapter.features().contains(wgpu::Features::SUBGROUP);
-    let required_features = if has_subgroups {
-        wgpu::Features::SUBGROUP
-    } else {
-        wgpu::Features::empty()
-    };
+    let has_float_atomics = wanted.float_atomics
+        && adapter
+            .features()
+            .contains(wgpu::Features::SHADER_FLOAT32_ATOMIC);
+    let mut required_features = wgpu::Features::empty();
+    required_features.set(wgpu::Features::SUBGROUP, has_subgroups);
+    required_features.set(wgpu::Features::SHADER_FLOAT32_ATOMIC, has_float_atomics);
     let limits = adapter.limits();
     let descriptor = wgpu::DeviceDescriptor {
         label: Some("splat-mapper"),
@@ -344,6 +347,7 @@ async fn open(wanted: Wanted) -> Result<Gpu, GpuError> {
         name,
         limits,
         lanes: lanes(&info, has_subgroups),
+        has_float_atomics,
         pipelines: RefCell::default(),
         bind_groups: RefCell::default(),
         meter: Arc::default(),

@@ -105,6 +105,10 @@ kernels! {
         step Uniform, projected Read, instances Read, tile_ranges Read, n_used Read, v_picture Read, behind_all Read,
         slots ReadWrite,
     ];
+    RASTER_BACKWARD_ATOMIC "raster_backward_atomic" lanes [
+        step Uniform, projected Read, instances Read, tile_ranges Read, n_used Read, v_picture Read, behind_all Read,
+        splat_sums ReadWrite,
+    ];
     GATHER "gather" 256 [camera Read, projected Read, places Read, slots Read, splat_sums ReadWrite];
     PROJECT_BACKWARD "project_backward" 256 [
         step Uniform, camera Read, projected Read, splat_sums Read, geometry ReadWrite, moments ReadWrite,
@@ -155,6 +159,7 @@ libraries![
     "sorting",
     "ssim",
     "step",
+    "tile_backward",
     "view",
 ];
 

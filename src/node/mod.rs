@@ -142,11 +142,12 @@ fn model(
 }
 
 /// The best engine that the parameters allow.
-pub fn engine(backend: Backend) -> anyhow::Result<Box<dyn Engine>> {
+pub fn engine(backend: Backend, deterministic: bool) -> anyhow::Result<Box<dyn Engine>> {
     let wgpu = |any_kind| {
         let wanted = Wanted {
             any_kind,
             subgroups: true,
+            float_atomics: !deterministic,
         };
         WgpuEngine::new(wanted)
     };

@@ -40,7 +40,7 @@ pub fn run(
         job.params.map.clone(),
         job.params.seed,
         scale,
-        engine(job.params.backend)?,
+        engine(job.params.backend, job.params.deterministic)?,
     );
     let stages = Stages {
         map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),

@@ -7,7 +7,7 @@ use std::mem::{offset_of, size_of};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::valid::{ShaderStages, SubgroupOperationSet};
 use naga::{AddressSpace, Module, ScalarKind, StorageAccess, TypeInner};
-use splat_mapper::gpu::kernel::{ALL, Access, Kernel, LIB, Lanes, PROJECT};
+use splat_mapper::gpu::kernel::{self, ALL, Access, Kernel, LIB, Lanes, PROJECT};
 use splat_mapper::gpu::types::{self, Camera, Moves, Projected, SortPass, Step};
 
 /// Without and with subgroups, as adapters have them.
@@ -37,7 +37,11 @@ fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
         .text(lanes)
         .ok_or("an #import names no file of shaders/lib, or a #repeat has no end")?;
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| e.emit_to_string(&text))?;
-    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::SUBGROUP);
+    let mut capabilities = Capabilities::SUBGROUP;
+    // The one that engines compile only where the adapter has float atomics.
+    let is_atomic = kernel.name == kernel::RASTER_BACKWARD_ATOMIC.name;
+    capabilities.set(Capabilities::SHADER_FLOAT32_ATOMIC, is_atomic);
+    let mut validator = Validator::new(ValidationFlags::all(), capabilities);
     if lanes.are_subgroup {
         validator
             .subgroup_stages(ShaderStages::COMPUTE)

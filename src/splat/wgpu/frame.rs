@@ -160,7 +160,8 @@ impl PerInstance {
             owners: words("owners", n)?,
             instances: words("instances", n)?,
             places: words("places", n)?,
-            slots: words("slots", 12 * n)?,
+            // Atomic sums need none.
+            slots: words("slots", if gpu.has_float_atomics() { 0 } else { 12 * n })?,
             sort: SortBuffers::new(gpu, n as u32)?,
         })
     }

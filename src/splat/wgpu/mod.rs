@@ -19,7 +19,7 @@ use crate::frame::DepthMap;
 use crate::gpu::GpuError;
 use crate::gpu::commands::Commands;
 use crate::gpu::device::{Gpu, Wanted};
-use crate::gpu::kernel;
+use crate::gpu::kernel::{self, Kernel};
 use crate::pose::Rigid;
 use crate::splat::{
     Engine, Match, McmcSettings, RefinerSettings, Rendering, Splats, StepSettings, StepStats,
@@ -53,7 +53,11 @@ impl WgpuEngine {
     /// On the best adapter. The shaders are compiled here, so that a fault shows before anything is mapped.
     pub fn new(wanted: Wanted) -> Result<Self, GpuError> {
         let gpu = Gpu::open(wanted)?;
-        gpu.compile(kernel::ALL)?;
+        let is_fit = |kernel: &&Kernel| {
+            gpu.has_float_atomics() || kernel.name != kernel::RASTER_BACKWARD_ATOMIC.name
+        };
+        let kernels: Vec<_> = kernel::ALL.iter().copied().filter(is_fit).collect();
+        gpu.compile(&kernels)?;
         Ok(Self {
             memory: SplatMemory::new(&gpu, 0)?,
             frame: Frame::new(&gpu)?,
@@ -64,6 +68,11 @@ impl WgpuEngine {
             has_warned_of_room: false,
             gpu,
         })
+    }
+
+    /// Whether sums of floats are made in any order: asked for, and the adapter can.
+    pub fn sums_in_any_order(&self) -> bool {
+        self.gpu.has_float_atomics()
     }
 
     /// Notes the first fault; what needs the GPU from then on answers nothing.

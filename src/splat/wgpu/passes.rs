@@ -8,8 +8,8 @@ use crate::gpu::buffer::Buffer;
 use crate::gpu::commands::Commands;
 use crate::gpu::kernel::{
     CULL, DEPTH_STRETCH, EMIT, GATHER, INSTANCE_ARGS, PHOTO_GRADIENT, PROJECT, PROJECT_BACKWARD,
-    RANGES, RASTER, RASTER_BACKWARD, SSIM_BACK, SSIM_ROWS, SSIM_TERMS, TILE_COUNTS, UPDATE_VIEW,
-    VIEW_CAMERA, VISIBLE_ARGS,
+    RANGES, RASTER, RASTER_BACKWARD, RASTER_BACKWARD_ATOMIC, SSIM_BACK, SSIM_ROWS, SSIM_TERMS,
+    TILE_COUNTS, UPDATE_VIEW, VIEW_CAMERA, VISIBLE_ARGS,
 };
 use crate::gpu::types::{
     ARGS_INSTANCES, ARGS_SORT_INSTANCES, ARGS_SORT_VISIBLE, ARGS_VISIBLE, Step,
@@ -152,7 +152,7 @@ pub(super) fn backward(
     wanted: &Buffer,
     step: &Step,
 ) -> Result<(), GpuError> {
-    let (s, i, p) = (&frame.per_splat, &frame.per_instance, &frame.per_pixel);
+    let (s, p) = (&frame.per_splat, &frame.per_pixel);
     let in_rows = (step.width_px.div_ceil(LOSS_RUN) * step.height_px).div_ceil(LOSS_GROUP);
     let in_columns = (step.width_px * step.height_px.div_ceil(LOSS_RUN)).div_ceil(LOSS_GROUP);
     let rows = [&frame.step, &frame.camera, &p.picture, wanted, &p.moments];
@@ -184,25 +184,7 @@ pub(super) fn backward(
         ];
         commands.dispatch(&DEPTH_STRETCH, &stretch, 1)?;
     }
-    let raster = [
-        &frame.step,
-        &s.projected,
-        &i.instances,
-        &p.tile_ranges,
-        &p.n_used,
-        &p.v_picture,
-        &p.behind,
-        &i.slots,
-    ];
-    commands.dispatch(&RASTER_BACKWARD, &raster, step.n_tiles_x * step.n_tiles_y)?;
-    let gather = [
-        &frame.camera,
-        &s.projected,
-        &i.places,
-        &i.slots,
-        &s.splat_sums,
-    ];
-    commands.dispatch_indirect(&GATHER, &gather, &frame.args, ARGS_VISIBLE)?;
+    sum_over_pixels(commands, frame, step)?;
     let project = [
         &frame.step,
         &frame.camera,
@@ -215,6 +197,41 @@ pub(super) fn backward(
         &s.pose_sums,
     ];
     commands.dispatch_indirect(&PROJECT_BACKWARD, &project, &frame.args, ARGS_VISIBLE)
+}
+
+/// Gradients of the pixels -> those of each visible splat's 2D Gaussian.
+fn sum_over_pixels(
+    commands: &mut Commands<'_>,
+    frame: &Frame,
+    step: &Step,
+) -> Result<(), GpuError> {
+    let (s, i, p) = (&frame.per_splat, &frame.per_instance, &frame.per_pixel);
+    let n_tiles = step.n_tiles_x * step.n_tiles_y;
+    let is_atomic = commands.gpu().has_float_atomics();
+    let sums = if is_atomic { &s.splat_sums } else { &i.slots };
+    let raster = [
+        &frame.step,
+        &s.projected,
+        &i.instances,
+        &p.tile_ranges,
+        &p.n_used,
+        &p.v_picture,
+        &p.behind,
+        sums,
+    ];
+    if is_atomic {
+        commands.clear(&s.splat_sums);
+        return commands.dispatch(&RASTER_BACKWARD_ATOMIC, &raster, n_tiles);
+    }
+    commands.dispatch(&RASTER_BACKWARD, &raster, n_tiles)?;
+    let gather = [
+        &frame.camera,
+        &s.projected,
+        &i.places,
+        &i.slots,
+        &s.splat_sums,
+    ];
+    commands.dispatch_indirect(&GATHER, &gather, &frame.args, ARGS_VISIBLE)
 }
 
 /// The view's record -> the camera of the step.
