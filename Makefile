@@ -1,5 +1,5 @@
 # The four lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint bench ablation setup
+.PHONY: demo test lint bench ablation soak setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -28,6 +28,13 @@ ablation:
 	scripts/setup build
 	cargo build --release --locked --bins --example ablation
 	target/release/examples/ablation
+
+# 100,000 steps on each backend: fails when a number is not finite or memory grows.
+soak:
+	scripts/setup test
+	cargo build --release --locked --example soak
+	target/release/examples/soak --backend cpu
+	target/release/examples/soak --backend wgpu
 
 setup:
 	scripts/setup all

@@ -1,6 +1,7 @@
-//! Time of each stage of a step and of whole steps, CPU engine, 270x480, by number of splats.
+//! Time of each stage of a step and of whole steps, 270x480, by number of splats.
 //!
-//! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have.
+//! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have. Whole steps also on the GPU,
+//! which may be software, and in maps of which most lies behind the camera.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -14,10 +15,12 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::frame::{DepthMap, RgbImage};
+use splat_mapper::gpu::device::Wanted;
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
 use splat_mapper::splat::cpu::raster_backward::{InstanceGradients, raster_backward};
 use splat_mapper::splat::cpu::{CpuEngine, bin, loss, project, raster};
+use splat_mapper::splat::wgpu::WgpuEngine;
 use splat_mapper::splat::{Engine, PoseStep, Splats, StepSettings, TrainingView};
 
 const WIDTH_PX: u32 = 270;
@@ -31,7 +34,15 @@ const SIZES: [(&str, usize, f64); 3] = [
     ("54k", 54_000, 2.0),
 ];
 
-criterion_group!(benches, stages);
+/// Splats in all, of which the first size is in view.
+const MAPS: [(&str, usize); 4] = [
+    ("10k", 10_000),
+    ("30k", 30_000),
+    ("100k", 100_000),
+    ("300k", 300_000),
+];
+
+criterion_group!(benches, stages, gpu_steps, maps);
 criterion_main!(benches);
 
 fn stages(c: &mut Criterion) {
@@ -46,6 +57,78 @@ fn stages(c: &mut Criterion) {
         group.finish();
         each_stage(c, name, &splats, &view);
     }
+}
+
+/// Whole steps with their wait, by how the GPU adds up.
+fn gpu_steps(c: &mut Criterion) {
+    for (kind, subgroups, float_atomics) in [
+        ("wgpu", true, false),
+        ("wgpu_plain", false, false),
+        ("wgpu_any_order", true, true),
+    ] {
+        let wanted = Wanted {
+            any_kind: true,
+            subgroups,
+            float_atomics,
+        };
+        for (name, n, size_px) in SIZES {
+            let Ok(mut engine) = WgpuEngine::new(wanted) else {
+                return;
+            };
+            let (splats, view) = scene(n, size_px);
+            bench_step(
+                c,
+                &format!("step_{kind}"),
+                name,
+                &mut engine,
+                &[splats],
+                view,
+            );
+        }
+    }
+}
+
+/// 10,000 splats in view, and in all as many as named.
+fn maps(c: &mut Criterion) {
+    for (name, n) in MAPS {
+        let (seen, view) = scene(SIZES[0].1, SIZES[0].2);
+        let (mut unseen, _) = scene(n - seen.len(), SIZES[0].2);
+        unseen.means.iter_mut().for_each(|[.., z]| *z = -*z);
+        let all = [seen, unseen];
+        let mut engine = CpuEngine::new();
+        bench_step(c, "step_in_map", name, &mut engine, &all, view.clone());
+        let wanted = Wanted {
+            any_kind: true,
+            subgroups: true,
+            float_atomics: false,
+        };
+        if let Ok(mut engine) = WgpuEngine::new(wanted) {
+            bench_step(c, "step_in_map_wgpu", name, &mut engine, &all, view);
+        }
+    }
+}
+
+fn bench_step(
+    c: &mut Criterion,
+    group: &str,
+    name: &str,
+    engine: &mut dyn Engine,
+    splats: &[Splats],
+    view: TrainingView,
+) {
+    splats.iter().for_each(|splats| engine.append(splats));
+    let view_ix = engine.add_view(view);
+    let mut group = c.benchmark_group(group);
+    configure(&mut group);
+    group.sample_size(10);
+    group.bench_function(name, |b| {
+        b.iter(|| {
+            engine.step(view_ix, &settings());
+            // Waits: a GPU's step only begins when it is asked for.
+            engine.take_stats()
+        });
+    });
+    group.finish();
 }
 
 fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingView) {
