@@ -23,10 +23,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let splat_ix = block * 256u + lane;
     if splat_ix < step.n_splats {
         let at = 4u * splat_ix;
-        let size_px = vec2<f32>(f32(step.width_px), f32(step.height_px));
-        let shape = shape_of(camera, geometry[at], geometry[at + 1u], geometry[at + 2u].xyz, size_px);
-        if shape.is_seen {
-            atomicOr(&bits[lane / 32u], 1u << (lane % 32u));
+        let mean = geometry[at];
+        // Most of a large map lies elsewhere: nothing more of those is read.
+        if in_camera(camera, mean.xyz).z > NEAR {
+            let size_px = vec2<f32>(f32(step.width_px), f32(step.height_px));
+            let shape = shape_of(camera, mean, geometry[at + 1u], geometry[at + 2u].xyz, size_px);
+            if shape.is_seen {
+                atomicOr(&bits[lane / 32u], 1u << (lane % 32u));
+            }
         }
     }
     workgroupBarrier();

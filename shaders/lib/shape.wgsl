@@ -45,11 +45,15 @@ struct Shape {
     extent_px: vec2<f32>,
 }
 
+fn in_camera(camera: Camera, mean: vec3<f32>) -> vec3<f32> {
+    return rotation_of_camera(camera) * mean + camera.translation.xyz;
+}
+
 fn shape_of(camera: Camera, mean: vec4<f32>, quat: vec4<f32>, log_scale: vec3<f32>, size_px: vec2<f32>) -> Shape {
     var s: Shape;
     s.is_seen = false;
     let to_cam = rotation_of_camera(camera);
-    s.in_cam = to_cam * mean.xyz + camera.translation.xyz;
+    s.in_cam = in_camera(camera, mean.xyz);
     s.opacity = 1.0 / (1.0 + exp(-mean.w));
     s.scale = exp(log_scale);
     let z = s.in_cam.z;

@@ -4,6 +4,8 @@
 //! so optimisers wander along it. And they tell little about a view that is badly wrong: one that has jumped goes
 //! back to the model's pose.
 
+use std::collections::BTreeSet;
+
 use glam::DVec3;
 
 use crate::config::PoseRefinement;
@@ -62,21 +64,18 @@ impl SplatMap {
     pub(super) fn hold_gauge(&mut self) {
         let Some(gauge) = self.gauge else { return };
         let mut map_poses = self.engine.poses();
+        self.put_back_jumps(&mut map_poses);
         let spread = self.spread(&map_poses);
         let back = self.back_to(&gauge.map_from_model, &map_poses);
         let shift = back.transform_point(self.centre(&map_poses)) - self.centre(&map_poses);
         let drift = (shift.length() / spread).max(back.angle_to(&Rigid::IDENTITY));
         if drift > MIN_DRIFT && back.is_finite() {
             self.engine.move_cameras(&back);
-            for pose in &mut map_poses {
-                *pose = (*pose * back.inverse()).renormalized();
-            }
             let mut splats = self.engine.splats();
             let carry = Carry::new(back, splats.sh_degree);
             (0..splats.len()).for_each(|i| carry.carry(&mut splats, i));
             self.engine.overwrite(&splats);
         }
-        self.put_back_jumps(&map_poses, spread);
     }
 
     /// Views put back because they had jumped.
@@ -84,32 +83,62 @@ impl SplatMap {
         self.n_put_back
     }
 
-    fn put_back_jumps(&mut self, map_poses: &[Rigid], spread: f64) {
-        let map_from_model = self.map_from_model(map_poses);
-        let [stated_turn, stated_shift] = self.pose_error.map(f64::from);
-        let max_turn = MAX_TURN_RAD.max(MAX_ERRORS * stated_turn);
-        let max_shift = (MAX_SHIFT * spread).max(MAX_ERRORS * stated_shift);
-        for (id, placed) in &self.keyframes.placed {
-            let wanted = map_from_model
-                .transform_pose(&placed.model_from_cam)
-                .inverse();
-            let found = &map_poses[placed.view_ix];
-            let shift = (wanted.inverse().translation - found.inverse().translation).length();
-            let turn = wanted.angle_to(found);
-            if found.is_finite() && turn <= max_turn && shift <= max_shift {
+    fn put_back_jumps(&mut self, map_poses: &mut [Rigid]) {
+        let jumped = self.jumped(map_poses);
+        if jumped.is_empty() {
+            return;
+        }
+        let map_from_model = self.map_from_model_without(map_poses, &jumped);
+        for id in &jumped {
+            let Some(placed) = self.keyframes.placed.get(id) else {
                 continue;
-            }
-            self.engine.set_pose(placed.view_ix, wanted);
+            };
+            let wanted = map_from_model.transform_pose(&placed.model_from_cam);
+            map_poses[placed.view_ix] = wanted.inverse();
+            self.engine.set_pose(placed.view_ix, wanted.inverse());
             self.n_put_back += 1;
-            tracing::debug!(
-                "keyframe {id} is put back: {:.1} deg and {:.3} of the spread of the cameras off",
-                turn.to_degrees(),
-                shift / spread
-            );
+            tracing::debug!("keyframe {id} is put back");
             if self.n_put_back == 1 {
                 tracing::warn!("keyframe {id} left the model's pose and is put back; said once");
             }
         }
+    }
+
+    /// Ids of views that have left the model's pose. The farthest is found first and then no longer asked where the
+    /// others lie: one that has jumped far would make all look as if they had.
+    fn jumped(&self, map_poses: &[Rigid]) -> BTreeSet<u32> {
+        let placed = &self.keyframes.placed;
+        let broken = placed
+            .iter()
+            .filter(|(_, p)| !map_poses[p.view_ix].is_finite());
+        let mut jumped: BTreeSet<u32> = broken.map(|(id, _)| *id).collect();
+        let [stated_turn, stated_shift] = self.pose_error.map(f64::from);
+        let max_turn = MAX_TURN_RAD.max(MAX_ERRORS * stated_turn);
+        while jumped.len() < placed.len() {
+            let map_from_model = self.map_from_model_without(map_poses, &jumped);
+            let wanted = |p: &Placed| map_from_model.transform_pose(&p.model_from_cam);
+            let rest = || placed.iter().filter(|(id, _)| !jumped.contains(id));
+            // Of the places that the model gives: what has jumped has no part in it.
+            let spread = self.spread_of(
+                &rest()
+                    .map(|(_, p)| wanted(p).translation)
+                    .collect::<Vec<_>>(),
+            );
+            let max_shift = (MAX_SHIFT * spread).max(MAX_ERRORS * stated_shift);
+            let farthest = rest()
+                .map(|(id, p)| {
+                    let (wanted, found) = (wanted(p), map_poses[p.view_ix].inverse());
+                    let shift = (wanted.translation - found.translation).length();
+                    let share = (wanted.angle_to(&found) / max_turn).max(shift / max_shift);
+                    (share, *id)
+                })
+                .max_by(|a, b| a.0.total_cmp(&b.0));
+            match farthest {
+                Some((share, id)) if share > 1.0 || share.is_nan() => jumped.insert(id),
+                _ => break,
+            };
+        }
+        jumped
     }
 
     /// The rigid motion of the map that takes the cameras' common place and heading to where the gauge has them.
@@ -139,17 +168,30 @@ impl SplatMap {
 
     /// RMS distance of the cameras to their mean.
     fn spread(&self, map_poses: &[Rigid]) -> f64 {
-        let n = self.anchored().count().max(1) as f64;
-        let centre = self.centre(map_poses);
-        let squares = self
+        let places = self
             .anchored()
-            .map(|p| (map_poses[p.view_ix].inverse().translation - centre).length_squared());
-        let spread = (squares.sum::<f64>() / n).sqrt();
+            .map(|p| map_poses[p.view_ix].inverse().translation);
+        self.spread_of(&places.collect::<Vec<_>>())
+    }
+
+    fn spread_of(&self, places: &[DVec3]) -> f64 {
+        let n = places.len().max(1) as f64;
+        let centre = places.iter().sum::<DVec3>() / n;
+        let squares: f64 = places
+            .iter()
+            .map(|at| (*at - centre).length_squared())
+            .sum();
+        let spread = (squares / n).sqrt();
         spread.max(MIN_SPREAD * f64::from(self.scene_depth))
     }
 
     /// From the poses that the model gave to where the same cameras stand; `map_poses` by view index.
     pub(super) fn map_from_model(&self, map_poses: &[Rigid]) -> Similarity {
-        align::align(&self.keyframes.pose_pairs(map_poses)).unwrap_or(Similarity::IDENTITY)
+        self.map_from_model_without(map_poses, &BTreeSet::new())
+    }
+
+    fn map_from_model_without(&self, map_poses: &[Rigid], ids: &BTreeSet<u32>) -> Similarity {
+        let pairs = self.keyframes.pose_pairs(map_poses, ids);
+        align::align(&pairs).unwrap_or(Similarity::IDENTITY)
     }
 }

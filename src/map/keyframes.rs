@@ -1,6 +1,6 @@
 //! Keyframes of the map: where each stands, in the model's frame and in the engine.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
@@ -66,13 +66,14 @@ impl Keyframes {
         counts
     }
 
-    /// (pose in the map, pose in the model's frame) of all that are optimised, else of all; `map_poses` by view index.
-    pub fn pose_pairs(&self, map_poses: &[Rigid]) -> Vec<(Rigid, Rigid)> {
+    /// (pose in the map, pose in the model's frame) of all that are optimised, else of all, but for the ids `without`;
+    /// `map_poses` by view index.
+    pub fn pose_pairs(&self, map_poses: &[Rigid], without: &BTreeSet<u32>) -> Vec<(Rigid, Rigid)> {
         let no_choice = self.placed.values().all(|p| p.is_held_out);
         self.placed
-            .values()
-            .filter(|p| no_choice || !p.is_held_out)
-            .map(|p| (map_poses[p.view_ix].inverse(), p.model_from_cam))
+            .iter()
+            .filter(|(id, p)| (no_choice || !p.is_held_out) && !without.contains(id))
+            .map(|(_, p)| (map_poses[p.view_ix].inverse(), p.model_from_cam))
             .collect()
     }
 }

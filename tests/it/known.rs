@@ -21,13 +21,13 @@ fn params() -> Params {
     Settings::shipped().params().unwrap()
 }
 
-fn room() -> (Vec<Frame>, Option<f64>) {
+pub fn room() -> (Vec<Frame>, Option<f64>) {
     let mut source = source::open(ROOM, &params().source, 0).unwrap();
     let extent = source.truth_extent();
     (std::iter::from_fn(|| source.next()).collect(), extent)
 }
 
-fn batch(id: u32, n_shared: usize, frames: &[(u32, Frame)]) -> Batch {
+pub fn batch(id: u32, n_shared: usize, frames: &[(u32, Frame)]) -> Batch {
     let keyframes = frames.iter().map(|(id, frame)| {
         Arc::new(Keyframe {
             id: *id,
@@ -42,12 +42,12 @@ fn batch(id: u32, n_shared: usize, frames: &[(u32, Frame)]) -> Batch {
     }
 }
 
-fn known(noise: KnownParams, extent: Option<f64>) -> Known {
+pub fn known(noise: KnownParams, extent: Option<f64>) -> Known {
     let params = params();
     Known::new(noise, (&params.sfm, &params.mvs), extent, 7).unwrap()
 }
 
-fn numbered(frames: &[Frame], with_depth: bool) -> Vec<(u32, Frame)> {
+pub fn numbered(frames: &[Frame], with_depth: bool) -> Vec<(u32, Frame)> {
     let bare = |frame: &Frame| Frame {
         truth_depth: frame.truth_depth.clone().filter(|_| with_depth),
         ..frame.clone()

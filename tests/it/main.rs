@@ -12,6 +12,7 @@ mod engine;
 mod eval;
 mod exposures;
 mod formats;
+mod gauge;
 mod gpu_memory;
 mod gpu_runs;
 mod gradients;
