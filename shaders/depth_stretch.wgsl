@@ -3,9 +3,9 @@
 // hundredth of a step. Equations: docs/GRADIENTS.md, losses.
 
 #import step
+#import depth_map
 
 const PAPER_ALPHA: u32 = 2u;
-const MIN_ALPHA_FOR_DEPTH: f32 = 0.5;
 // What spans less, relative to its largest number, is flat: stretching it would amplify rounding.
 const MIN_RELATIVE_RANGE: f32 = 1e-3;
 const LARGEST: f32 = 3.4e38;
@@ -32,13 +32,9 @@ var<workgroup> high_ixs: array<u32, 256>;
 var<workgroup> sums: array<vec4<f32>, 256>;
 
 fn pixel_at(p: u32) -> Pixel {
-    let x = p % step.width_px;
-    let y = p / step.width_px;
-    let map_x = (2u * x + 1u) * step.depth_width / (2u * step.width_px);
-    let map_y = (2u * y + 1u) * step.depth_height / (2u * step.height_px);
-    let at = step.width_px * step.height_px + 2u * (map_y * step.depth_width + map_x);
-    let depth = bitcast<f32>(wanted[at]);
-    let confidence = bitcast<f32>(wanted[at + 1u]) * unpack4x8unorm(wanted[p]).w;
+    let given = depth_and_confidence(p % step.width_px, p / step.width_px);
+    let depth = given.x;
+    let confidence = given.y * unpack4x8unorm(wanted[p]).w;
     let alpha = 1.0 - picture[p].w;
     if confidence <= 0.0 || alpha <= MIN_ALPHA_FOR_DEPTH {
         return Pixel(false, alpha, 0.0, 0.0);

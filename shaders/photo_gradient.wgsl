@@ -4,11 +4,10 @@
 #import step
 #import camera
 #import ssim
+#import depth_map
 
 // Relative error of inverse depth at which the depth loss turns from square to linear.
 const HUBER_DELTA: f32 = 0.05;
-// A pixel that is mostly see-through has no depth to speak of.
-const MIN_ALPHA_FOR_DEPTH: f32 = 0.5;
 const MIN_WEIGHT_SUM: f32 = 1e-6;
 
 @group(0) @binding(0) var<uniform> step: Step;
@@ -33,11 +32,9 @@ struct Depth {
 }
 
 fn depth_loss(x: u32, y: u32, alpha: f32, z: f32, weight: f32) -> Depth {
-    let map_x = (2u * x + 1u) * step.depth_width / (2u * step.width_px);
-    let map_y = (2u * y + 1u) * step.depth_height / (2u * step.height_px);
-    let at = step.width_px * step.height_px + 2u * (map_y * step.depth_width + map_x);
-    let depth = bitcast<f32>(wanted[at]);
-    let confidence = bitcast<f32>(wanted[at + 1u]) * weight;
+    let given = depth_and_confidence(x, y);
+    let depth = given.x;
+    let confidence = given.y * weight;
     if confidence <= 0.0 || alpha <= MIN_ALPHA_FOR_DEPTH {
         return Depth(0.0, 0.0);
     }

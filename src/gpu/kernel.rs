@@ -145,6 +145,7 @@ libraries![
     "blend",
     "camera",
     "cleared",
+    "depth_map",
     "groups",
     "lane_sum_shared",
     "lane_sum_subgroup",
