@@ -294,7 +294,7 @@ fn disturbed_poses_come_back_by_joint_optimisation() {
             ("own increments", 1e-3, 0.0, 0.2),
             // The rate is that of 3R-GS.
             ("network and own increments", 1e-3, 1.5e-4, 0.2),
-            ("network", 0.0, 2e-3, 0.4),
+            ("network", 0.0, 2e-3, 0.5),
         ] {
             let settings = StepSettings {
                 pose: if lr_refiner > 0.0 {
