@@ -4,15 +4,6 @@
 
 #import tile_backward
 
-@group(0) @binding(0) var<uniform> step: Step;
-@group(0) @binding(1) var<storage, read> projected: array<Projected>;
-@group(0) @binding(2) var<storage, read> instances: array<u32>;
-@group(0) @binding(3) var<storage, read> tile_ranges: array<vec2<u32>>;
-@group(0) @binding(4) var<storage, read> n_used: array<u32>;
-// By r, g, b and the depth sum.
-@group(0) @binding(5) var<storage, read> v_picture: array<vec4<f32>>;
-// What lies behind the first splat, seen through the gradient, less the transmittance's part.
-@group(0) @binding(6) var<storage, read> behind_all: array<f32>;
 // Three vec4 an instance, see `gather`.
 @group(0) @binding(7) var<storage, read_write> slots: array<vec4<f32>>;
 

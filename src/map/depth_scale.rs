@@ -63,11 +63,13 @@ fn factor(depth: &DepthMap, rendering: &Rendering) -> Option<f32> {
     let (width, height) = (depth.width_px as usize, depth.height_px as usize);
     let (shown_width, shown_height) = (rendering.width_px as usize, rendering.height_px as usize);
     let mut ratios = Vec::new();
-    for (q, (given, confidence)) in depth.depth.iter().zip(&depth.confidence).enumerate() {
-        let is_given = *confidence > 0.0 && *given > 0.0 && given.is_finite();
+    for q in 0..depth.depth.len() {
+        let Some((given, confidence)) = depth.verified(q) else {
+            continue;
+        };
         let p = (q / width * shown_height / height) * shown_width + q % width * shown_width / width;
-        if is_given && rendering.alpha[p] > MIN_ALPHA {
-            ratios.push((rendering.depth[p] / given, *confidence));
+        if rendering.alpha[p] > MIN_ALPHA {
+            ratios.push((rendering.depth[p] / given, confidence));
         }
     }
     ratios.sort_by(|a, b| a.0.total_cmp(&b.0));

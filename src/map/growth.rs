@@ -2,10 +2,12 @@
 
 use rand::RngExt;
 
+use crate::camera::Intrinsics;
 use crate::map::SplatMap;
 use crate::map::schedule::Phase;
 use crate::map::seed::{self, SeedView};
 use crate::map::transient;
+use crate::pose::Rigid;
 use crate::splat::{McmcSettings, Rendering};
 
 /// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
@@ -39,7 +41,10 @@ impl SplatMap {
         if room == 0 {
             return;
         }
-        let rendering = self.shown(keyframe_id, 0);
+        let Some(camera) = self.camera(keyframe_id) else {
+            return;
+        };
+        let rendering = self.shown(&camera, 0);
         let Some(placed) = self
             .keyframes
             .placed
@@ -51,8 +56,8 @@ impl SplatMap {
         let view = SeedView {
             keyframe_id,
             image: &placed.image,
-            intrinsics: &placed.intrinsics.refocused(self.engine.focal_factor()),
-            map_from_cam: &self.engine.poses()[placed.view_ix].inverse(),
+            intrinsics: &camera.0,
+            map_from_cam: &camera.1.inverse(),
             depth: &placed.depth,
             rendering: rendering.as_ref(),
             fills_gaps,
@@ -102,22 +107,26 @@ impl SplatMap {
         (self.params.max_splats as f64 * share) as usize
     }
 
-    /// What the map shows in a keyframe; `None` for an empty map.
-    fn shown(&mut self, keyframe_id: u32, sh_degree: u8) -> Option<Rendering> {
+    /// A keyframe's camera as it is refined by now.
+    pub(super) fn camera(&mut self, keyframe_id: u32) -> Option<(Intrinsics, Rigid)> {
         let placed = self.keyframes.placed.get(&keyframe_id)?;
-        if self.engine.n_splats() == 0 {
-            return None;
-        }
-        let cam_from_map = self.engine.poses()[placed.view_ix];
         let intrinsics = placed.intrinsics.refocused(self.engine.focal_factor());
-        Some(self.engine.render(&intrinsics, &cam_from_map, sh_degree))
+        Some((intrinsics, self.engine.poses()[placed.view_ix]))
+    }
+
+    /// What the map shows to a camera; `None` for an empty map.
+    fn shown(&mut self, camera: &(Intrinsics, Rigid), sh_degree: u8) -> Option<Rendering> {
+        let (intrinsics, cam_from_map) = camera;
+        let is_empty = self.engine.n_splats() == 0;
+        (!is_empty).then(|| self.engine.render(intrinsics, cam_from_map, sh_degree))
     }
 
     fn mask_transients(&mut self, keyframe_id: u32) {
         if self.params.transient >= 1.0 {
             return;
         }
-        let rendering = self.shown(keyframe_id, self.params.sh_degree);
+        let camera = self.camera(keyframe_id);
+        let rendering = camera.and_then(|camera| self.shown(&camera, self.params.sh_degree));
         let placed = self.keyframes.placed.get(&keyframe_id);
         if let Some((placed, rendering)) = placed.zip(rendering) {
             let mask = transient::mask(&placed.image, &rendering, self.params.transient);

@@ -44,17 +44,11 @@ impl SplatMap {
 
     /// What the map shows from a keyframe, beside the picture that was taken there.
     pub fn render_keyframe(&mut self, keyframe_id: u32) -> Option<(Rendering, Arc<RgbImage>)> {
-        let (view_ix, intrinsics, image) = {
-            let placed = self.keyframes.placed.get(&keyframe_id)?;
-            (placed.view_ix, placed.intrinsics, Arc::clone(&placed.image))
-        };
-        let cam_from_map = self.engine.poses()[view_ix];
-        let intrinsics = intrinsics.refocused(self.engine.focal_factor());
+        let image = Arc::clone(&self.keyframes.placed.get(&keyframe_id)?.image);
+        let (intrinsics, cam_from_map) = self.camera(keyframe_id)?;
         let sh_degree = self.params.sh_degree;
-        Some((
-            self.engine.render(&intrinsics, &cam_from_map, sh_degree),
-            image,
-        ))
+        let rendering = self.engine.render(&intrinsics, &cam_from_map, sh_degree);
+        Some((rendering, image))
     }
 
     fn held_out(&self) -> Vec<usize> {

@@ -140,11 +140,10 @@ pub fn settings(
 }
 
 fn pose_step(params: &MapParams) -> PoseStep {
+    let moves_alone = params.lr_rotation > 0.0 || params.lr_translation > 0.0;
     match params.pose {
-        PoseRefinement::Direct if params.lr_rotation > 0.0 || params.lr_translation > 0.0 => {
-            PoseStep::Direct
-        }
-        PoseRefinement::Shared if params.lr_refiner > 0.0 => PoseStep::Shared,
+        PoseRefinement::Direct if moves_alone => PoseStep::Direct,
+        PoseRefinement::Shared if moves_alone || params.lr_refiner > 0.0 => PoseStep::Shared,
         _ => PoseStep::Held,
     }
 }

@@ -5,21 +5,12 @@ use splat_mapper::splat::gradients::Gradients;
 use splat_mapper::splat::{DepthMode, Engine, Rendering, Splats, StepSettings, TrainingView};
 
 use crate::gpu_runs::{gpu_engine, gpu_gradients};
+use crate::reference::differences::ARRAYS;
 use crate::reference::hostile::{KINDS, camera};
 use crate::reference::loss_depth::MIN_DEPTH_ALPHA;
 use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::{self, Params, Target, Weights};
 
-const ARRAYS: [&str; 8] = [
-    "means",
-    "log_scales",
-    "quats",
-    "opacity_logits",
-    "sh",
-    "pose",
-    "exposure",
-    "log_focal",
-];
 const PLAIN: [[f32; 3]; 2] = [[0.0; 3]; 2];
 /// Errors of the arrays and of the loss.
 type Errors = [f64; 9];
