@@ -236,7 +236,8 @@ impl MapStage {
         let (first, last) = (self.map.n_steps(), self.params.steps);
         let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
         self.make_steps(last, &phase, publish);
-        if !self.stop.is_asked() {
+        // Splats as they were seeded say less of a pose than the geometry that seeded them.
+        if self.map.n_steps() > 0 && !self.stop.is_asked() {
             self.map.refine_held_out();
         }
         self.optimise_secs += watch.secs();
