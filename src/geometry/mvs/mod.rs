@@ -9,6 +9,7 @@ mod planes;
 mod sgm;
 pub mod state;
 mod sweep;
+mod zncc;
 
 use std::sync::Arc;
 
@@ -108,7 +109,7 @@ impl Prepared {
 }
 
 /// Two matching windows; smaller pictures hold no depth worth having.
-const MIN_SIDE_PX: usize = 2 * sweep::WINDOW;
+const MIN_SIDE_PX: usize = 2 * zncc::WINDOW;
 
 fn sweep_prepared(
     reference: &Prepared,

@@ -99,6 +99,7 @@ impl MvsState {
             .take(self.params.n_sources)
             .collect();
         let pictures: Vec<&Prepared> = sources.iter().map(|(_, prepared)| *prepared).collect();
+        tracing::debug!(keyframe_id, n_sources = sources.len(), near, far, "sweep");
         let raw = sweep_prepared(reference, &pictures, near, far, &self.params);
         let sources = sources
             .iter()
