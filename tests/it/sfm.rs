@@ -18,6 +18,39 @@ pub(crate) struct Shown {
     pub(crate) truth: Vec<Rigid>,
 }
 
+impl Shown {
+    pub(crate) fn without_calibration(&self) -> Self {
+        self.renumbered(0..self.keyframes.len(), |frame| frame.intrinsics = None)
+    }
+
+    pub(crate) fn part(&self, range: std::ops::Range<usize>) -> Self {
+        self.renumbered(range, |_| ())
+    }
+
+    pub(crate) fn in_order(&self, order: &[usize]) -> Self {
+        self.renumbered(order.iter().copied(), |_| ())
+    }
+
+    fn renumbered(
+        &self,
+        picked: impl IntoIterator<Item = usize>,
+        change: impl Fn(&mut Frame),
+    ) -> Self {
+        let (mut keyframes, mut truth) = (Vec::new(), Vec::new());
+        for ix in picked {
+            let mut frame = self.keyframes[ix].frame.clone();
+            change(&mut frame);
+            keyframes.push(Arc::new(Keyframe {
+                id: keyframes.len() as u32,
+                frame,
+                age: self.keyframes[ix].age,
+            }));
+            truth.push(self.truth[ix]);
+        }
+        Self { keyframes, truth }
+    }
+}
+
 /// Every `stride`-th picture of a scene's folder, at most `max_side` pixels long, with its reference pose.
 pub(crate) fn shown(folder: &Path, max_side: u32, stride: usize, calibrated: bool) -> Shown {
     let list = std::fs::read_to_string(folder.join("images.txt")).unwrap();
@@ -119,6 +152,8 @@ pub(crate) struct Figures {
     pub(crate) components: usize,
     pub(crate) ate_percent: f64,
     pub(crate) rotation_deg: f64,
+    /// Of the last placed keyframe, in its picture.
+    pub(crate) focal_px: f64,
     pub(crate) note: Option<String>,
 }
 
@@ -131,12 +166,15 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let params = settings.params().unwrap();
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
     let mut poses = std::collections::BTreeMap::new();
+    let mut focal_px = f64::NAN;
     let mut take = |out: &SparseBatch| {
         for view in &out.views {
             poses.insert(view.keyframe_id, (view.component, view.batch_from_cam));
+            focal_px = view.intrinsics.fx;
         }
         for new in &out.revised {
             poses.insert(new.keyframe_id, (new.component, new.batch_from_cam));
+            focal_px = new.intrinsics.fx;
         }
     };
     let (mut from, mut batch_id) = (0, 0);
@@ -168,6 +206,7 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
         components: components.len(),
         ate_percent,
         rotation_deg,
+        focal_px,
         note: last.note,
     }
 }

@@ -10,9 +10,9 @@ use crate::frame::DepthMap;
 use crate::pose::Rigid;
 
 /// There and back again must land this close to the start, in pixels of the depth map.
-const MAX_RETURN_PX: f64 = 1.0;
+const MAX_RETURN_PX: f64 = 1.5;
 /// And at this depth, relative.
-const MAX_DEPTH_ERROR: f64 = 0.01;
+const MAX_DEPTH_ERROR: f64 = 0.02;
 /// Four depths this far apart (relative) lie on different surfaces: no value between them.
 const SURFACE_GAP: f32 = 0.03;
 /// Views from nearly the same place agree on any depth.

@@ -1,0 +1,264 @@
+//! Dense depth by structure from motion and stereo: how much is kept, and how far off it is.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2, DVec3};
+use splat_mapper::config::Settings;
+use splat_mapper::frame::{Batch, Keyframe};
+use splat_mapper::geometry::sfm::Sfm;
+use splat_mapper::geometry::{GeometryModel, View};
+use splat_mapper::pose::Rigid;
+use splat_mapper::source::synthetic::take::Take;
+use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
+
+use crate::hard_pictures::{hall, stroll};
+use crate::hard_world::{Flaws, LENS, Paint, depth, film};
+use crate::scenes::scene;
+use crate::sfm::{Shown, keyframe, shown};
+
+/// What the model has said of each keyframe at the end, and where keyframes saw which landmark.
+struct Told {
+    views: BTreeMap<u32, View>,
+    sightings: BTreeMap<u32, Vec<(u32, DVec2)>>,
+}
+
+fn told(shown: &Shown, changes: &[&str]) -> Told {
+    let mut settings = Settings::shipped();
+    changes
+        .iter()
+        .for_each(|change| settings.merge_setting(change).unwrap());
+    let params = settings.params().unwrap();
+    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
+    let mut told = Told {
+        views: BTreeMap::new(),
+        sightings: BTreeMap::new(),
+    };
+    let mut take = |batch: splat_mapper::geometry::GeometryBatch| {
+        for view in batch.views {
+            told.views.insert(view.keyframe_id, view);
+        }
+        for revision in batch.revised {
+            let Some(view) = told.views.get_mut(&revision.keyframe_id) else {
+                continue;
+            };
+            view.batch_from_cam = revision.batch_from_cam;
+            view.intrinsics = revision.intrinsics;
+        }
+        for seen in batch.sightings {
+            let landmarks = seen.landmarks.iter();
+            let landmarks = landmarks
+                .map(|(id, p)| (*id, DVec2::new(f64::from(p[0]), f64::from(p[1]))))
+                .collect();
+            told.sightings.insert(seen.keyframe_id, landmarks);
+        }
+    };
+    for (id, keyframes) in batches(&shown.keyframes, 8, 3).into_iter().enumerate() {
+        let batch = Batch {
+            id: id as u32,
+            n_shared: if id == 0 { 0 } else { 3 },
+            keyframes,
+        };
+        take(sfm.infer(&batch).unwrap());
+    }
+    take(sfm.finish().unwrap());
+    told
+}
+
+fn batches(keyframes: &[Arc<Keyframe>], size: usize, shared: usize) -> Vec<Vec<Arc<Keyframe>>> {
+    let starts = (0..keyframes.len().saturating_sub(shared)).step_by(size - shared);
+    starts
+        .map(|from| keyframes[from..(from + size).min(keyframes.len())].to_vec())
+        .collect()
+}
+
+/// Errors of the kept pixels, relative, sorted; and the share of pixels kept. `truth` gives the exact depth of a
+/// keyframe at a size.
+fn against_truth(
+    told: &Told,
+    shown: &Shown,
+    truth: &dyn Fn(u32, [u32; 2]) -> Vec<f64>,
+) -> (Vec<f64>, f64) {
+    let scale = scale_of(told, shown);
+    let (mut errors, mut all) = (Vec::new(), 0);
+    for (id, view) in &told.views {
+        let truth = truth(*id, [view.depth.width_px, view.depth.height_px]);
+        all += truth.len();
+        for (q, truth) in truth.into_iter().enumerate() {
+            let found = view.depth.depth[q];
+            if view.depth.confidence[q] > 0.0 {
+                errors.push((f64::from(found) * scale / truth - 1.0).abs());
+            }
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    let kept = errors.len() as f64 / f64::from(all as u32);
+    (errors, kept)
+}
+
+/// Metres per unit: mean distance of the cameras from their mean, true and found.
+fn scale_of(told: &Told, shown: &Shown) -> f64 {
+    let spread = |places: Vec<DVec3>| {
+        let mean = places.iter().sum::<DVec3>() / places.len() as f64;
+        places.iter().map(|p| p.distance(mean)).sum::<f64>()
+    };
+    let truth = told.views.keys().map(|id| shown.truth[*id as usize]);
+    let found = told.views.values().map(|view| view.batch_from_cam);
+    spread(truth.map(|p| p.translation).collect()) / spread(found.map(|p| p.translation).collect())
+}
+
+/// Errors of the depth maps at the landmarks, which are triangulated here from where they were seen.
+fn against_landmarks(told: &Told) -> Vec<f64> {
+    let mut seen: BTreeMap<u32, Vec<(u32, DVec2)>> = BTreeMap::new();
+    for (id, landmarks) in &told.sightings {
+        for (landmark, pixel) in landmarks {
+            seen.entry(*landmark).or_default().push((*id, *pixel));
+        }
+    }
+    let mut errors = Vec::new();
+    for sights in seen.values().filter(|sights| sights.len() >= 3) {
+        let rays: Vec<(DVec3, DVec3)> = sights
+            .iter()
+            .map(|(id, pixel)| {
+                let view = &told.views[id];
+                let direction = view.batch_from_cam.rotation * view.intrinsics.ray_in_cam(*pixel);
+                (view.batch_from_cam.translation, direction.normalize())
+            })
+            .collect();
+        let Some(point) = nearest_point(&rays) else {
+            continue;
+        };
+        for (id, pixel) in sights {
+            let view = &told.views[id];
+            let own = view.batch_from_cam.inverse().transform_point(point).z;
+            let (w, h) = (view.depth.width_px, view.depth.height_px);
+            let x = (pixel.x / f64::from(view.intrinsics.width_px) * f64::from(w)) as u32;
+            let y = (pixel.y / f64::from(view.intrinsics.height_px) * f64::from(h)) as u32;
+            let q = (y.min(h - 1) * w + x.min(w - 1)) as usize;
+            if view.depth.confidence[q] > 0.0 {
+                errors.push((f64::from(view.depth.depth[q]) / own - 1.0).abs());
+            }
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    errors
+}
+
+/// The point nearest to all rays; `None` where they are almost parallel or pass it far off.
+fn nearest_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
+    let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
+    for (from, along) in rays {
+        let across = DMat3::IDENTITY
+            - DMat3::from_cols(*along * along.x, *along * along.y, *along * along.z);
+        a += across;
+        b += across * *from;
+    }
+    let point = a.inverse() * b;
+    let widest = rays
+        .iter()
+        .map(|r| r.1.angle_between(rays[0].1).to_degrees())
+        .fold(0.0, f64::max);
+    let passes = |(from, along): &(DVec3, DVec3)| (point - *from).angle_between(*along) < 0.004;
+    (point.is_finite() && widest >= 3.0 && rays.iter().all(passes)).then_some(point)
+}
+
+fn quantile(sorted: &[f64], share: f64) -> f64 {
+    sorted[(share * (sorted.len() - 1) as f64) as usize]
+}
+
+/// Bounds of a stereo depth map: median error, share beyond 5 %; `least` of the pixels must be kept.
+#[track_caller]
+fn holds(name: &str, (errors, kept): (Vec<f64>, f64), least: f64) {
+    let far_off = errors.iter().filter(|e| **e > 0.05).count() as f64 / errors.len() as f64;
+    let median = quantile(&errors, 0.5);
+    eprintln!("{name}: kept {kept:.3}, median {median:.5}, beyond 5 %: {far_off:.4}");
+    assert!(
+        kept >= least && median <= 0.005 && far_off <= 0.02,
+        "{name}: {kept} kept, median {median}, {far_off} beyond 5 %"
+    );
+}
+
+#[test]
+fn a_hall_is_measured_to_half_a_percent() {
+    let shown = film(&hall(Paint::Varied), &stroll(), Flaws::default(), LENS);
+    let told = told(&shown, &["sfm.max_side=400", "sfm.max_features=1000"]);
+    let truth = |id: u32, [w, h]: [u32; 2]| {
+        depth(
+            &hall(Paint::Varied),
+            &shown.truth[id as usize],
+            &LENS.resized(w, h),
+        )
+    };
+    holds("hall", against_truth(&told, &shown, &truth), 0.7);
+}
+
+#[test]
+fn made_up_scenes_are_measured_to_half_a_percent() {
+    for scene in [SceneKind::Room, SceneKind::Facade] {
+        let settings = SynthSettings {
+            width_px: 480,
+            height_px: 360,
+            n_frames: 60,
+            noise: 1.0,
+            ..SynthSettings::of(scene)
+        };
+        let take = Take::new(settings).unwrap();
+        let lens = take.settings().lens().intrinsics;
+        let ids: Vec<u32> = (0..12).map(|i| 3 * i).collect();
+        let keyframes = ids.iter().enumerate().map(|(id, ix)| {
+            let picture = take.picture(*ix);
+            let image = image::RgbImage::from_raw(480, 360, picture.pixels).unwrap();
+            keyframe(id as u32, f64::from(*ix), &image, 480, &lens, true)
+        });
+        let shown = Shown {
+            keyframes: keyframes.collect(),
+            truth: ids.iter().map(|ix| take.pose(*ix)).collect(),
+        };
+        let told = told(&shown, &["sfm.max_side=480", "sfm.max_features=1000"]);
+        assert!(
+            told.views.len() >= 11,
+            "{scene:?}: {} placed",
+            told.views.len()
+        );
+        let truth = |id: u32, [w, h]: [u32; 2]| {
+            let depth = take.depth(ids[id as usize], &lens.resized(w, h)).depth;
+            depth.into_iter().map(f64::from).collect()
+        };
+        holds(
+            &format!("{scene:?}"),
+            against_truth(&told, &shown, &truth),
+            0.4,
+        );
+    }
+}
+
+#[test]
+fn three_quarters_of_the_fox_are_kept_and_fit_its_landmarks() {
+    let Some(folder) = scene("fox") else { return };
+    let shown = shown(&folder, 640, 1, true);
+    let told = told(&shown, &[]);
+    let errors = against_landmarks(&told);
+    let (kept, all) = told.views.values().fold((0, 0), |(kept, all), view| {
+        let n = view.depth.confidence.iter().filter(|c| **c > 0.0).count();
+        (kept + n, all + view.depth.confidence.len())
+    });
+    let kept = kept as f64 / f64::from(all as u32);
+    let median = quantile(&errors, 0.5);
+    eprintln!(
+        "fox: kept {kept:.3}, median {median:.5} of {} sightings",
+        errors.len()
+    );
+    assert!(
+        errors.len() > 5000 && kept >= 0.75 && median <= 0.005,
+        "{kept} {median}"
+    );
+}
+
+#[test]
+fn depth_is_where_the_surface_is_and_not_behind_the_camera() {
+    // The truth itself, so that the tests above measure what they say.
+    let pose = Rigid::IDENTITY;
+    let truth = depth(&hall(Paint::Varied), &pose, &LENS);
+    let centre = truth[(150 * 400 + 200) as usize];
+    assert!((centre - 7.0).abs() < 1e-9, "{centre}");
+}
