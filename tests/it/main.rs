@@ -41,6 +41,7 @@ mod scene_formats;
 mod scene_reference;
 mod scenes;
 mod sfm;
+mod shader_layouts;
 mod shaders;
 mod shared_poses;
 mod sources;
