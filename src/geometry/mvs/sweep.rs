@@ -16,10 +16,10 @@ const RADIUS: usize = WINDOW / 2;
 
 /// Variance of a pixel that is noise only, squared luma: about one grey level after averaging. It pulls the ZNCC of
 /// blank walls to 0, where smoothness decides, instead of letting noise decide.
-const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
+pub(super) const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
 
 /// Cost of a plane that no source sees: as bad as a ZNCC of this.
-const UNSEEN_ZNCC: f32 = 0.2;
+pub(super) const UNSEEN_ZNCC: f32 = 0.2;
 
 /// Below this angle between the rays, depth from noisy poses is guesswork.
 const MIN_ANGLE_RAD: f64 = 0.008;
@@ -32,7 +32,7 @@ const MIN_TRAVEL_PX: f64 = 1.5;
 pub(super) struct Warp<'a> {
     pub(super) source: &'a Grey,
     /// Columns for x, y and 1. Pixel index space on both sides: centres at integers.
-    pixel_map: [[f64; 3]; 3],
+    pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
 }
 
@@ -84,7 +84,7 @@ impl<'a> Warp<'a> {
         longest
     }
 
-    fn homogeneous(&self, x: f64, y: f64, inverse_depth: f64) -> glam::DVec3 {
+    pub(super) fn homogeneous(&self, x: f64, y: f64, inverse_depth: f64) -> glam::DVec3 {
         let column = |ix: usize| glam::DVec3::from_array(self.pixel_map[ix]);
         column(0) * x
             + column(1) * y
@@ -150,15 +150,15 @@ pub(super) fn matching_costs(reference: &Grey, warps: &[Warp<'_>], planes: &Plan
 }
 
 /// Sums over the window around each reference pixel, cut off at the border of the picture.
-struct Statistics {
-    sum: Vec<f32>,
+pub(super) struct Statistics {
+    pub(super) sum: Vec<f32>,
     /// n * variance + noise.
-    spread: Vec<f32>,
-    one_over_n: Vec<f32>,
+    pub(super) spread: Vec<f32>,
+    pub(super) one_over_n: Vec<f32>,
 }
 
 impl Statistics {
-    fn of(grey: &Grey) -> Self {
+    pub(super) fn of(grey: &Grey) -> Self {
         let n_pixels = grey.values.len();
         let mut all = Self {
             sum: vec![0.0; n_pixels],
