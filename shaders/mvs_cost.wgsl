@@ -24,9 +24,8 @@ const PATCH_X: u32 = SWEEP_TILE_X + SWEEP_WINDOW - 1u;
 const PATCH_Y: u32 = SWEEP_TILE_Y + SWEEP_WINDOW - 1u;
 const N_PATCH: u32 = PATCH_X * PATCH_Y;
 
-// 0 outside of the reference picture, so that what lies there adds nothing to any sum.
-var<workgroup> reference: array<f32, N_PATCH>;
-var<workgroup> warped: array<f32, N_PATCH>;
+// Source, warped, and reference. 0 outside of the reference picture: what lies there adds nothing to any sum.
+var<workgroup> patches: array<vec2<f32>, N_PATCH>;
 
 fn is_in_reference(at: vec2<i32>) -> bool {
     return at.x >= 0 && at.y >= 0 && at.x < i32(sweep.width_px) && at.y < i32(sweep.height_px);
@@ -84,10 +83,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     for (var ix = lane; ix < N_PATCH; ix += 64u) {
         let at = patch_pixel(tile_from, ix);
-        reference[ix] = 0.0;
+        var value = 0.0;
         if is_in_reference(at) {
-            reference[ix] = luma[u32(at.y) * sweep.width_px + u32(at.x)];
+            value = luma[u32(at.y) * sweep.width_px + u32(at.x)];
         }
+        patches[ix].y = value;
     }
     let column = lane % SWEEP_TILE_X;
     let row = lane / SWEEP_TILE_X * RUN;
@@ -115,10 +115,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             workgroupBarrier();
             for (var ix = lane; ix < N_PATCH; ix += 64u) {
                 let at = patch_pixel(tile_from, ix);
-                warped[ix] = 0.0;
+                var value = 0.0;
                 if is_in_reference(at) {
-                    warped[ix] = luma_in_source(warp, pixel_in_source(warp, start, at).xy);
+                    value = luma_in_source(warp, pixel_in_source(warp, start, at).xy);
                 }
+                patches[ix].x = value;
             }
             workgroupBarrier();
             // Source, source squared, source times reference: along the rows of the window, then down.
@@ -127,8 +128,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             {
                 let first = (row + $ju) * PATCH_X + column;
 #repeat t 7
-                let value_$t = warped[first + $tu];
-                across_$j += value_$t * vec3<f32>(1.0, value_$t, reference[first + $tu]);
+                let pair_$t = patches[first + $tu];
+                across_$j += pair_$t.x * vec3<f32>(1.0, pair_$t);
 #end
             }
 #end

@@ -32,7 +32,8 @@ impl Matcher {
         match std::mem::replace(self, Self::Cpu) {
             Self::Cpu => task.winners_on_cpu(),
             Self::Undecided => {
-                let (winners, faster) = timed(task);
+                // Software Vulkan is slower than native code, so only hardware will do.
+                let (winners, faster) = timed(task, wanted(false));
                 *self = faster;
                 winners
             }
@@ -60,9 +61,8 @@ fn wanted(any_kind: bool) -> Wanted {
 }
 
 /// The result of whichever machine is faster, and that machine.
-fn timed(task: &Task<'_>) -> (Winners, Matcher) {
-    // Software Vulkan is slower than native code, so only hardware will do.
-    let mut gpu = match GpuMatcher::open(wanted(false)) {
+pub(super) fn timed(task: &Task<'_>, wanted: Wanted) -> (Winners, Matcher) {
+    let mut gpu = match GpuMatcher::open(wanted) {
         Ok(gpu) => Box::new(gpu),
         Err(error) => {
             tracing::debug!("depth is matched on the CPU: {error}");

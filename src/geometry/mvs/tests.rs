@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{DQuat, DVec2, DVec3};
 
 use super::gpu::GpuMatcher;
-use super::matcher::Matcher;
+use super::matcher::{Matcher, timed};
 use super::sgm::Winners;
 use super::state::MvsState;
 use super::sweep as sweep_on_cpu;
@@ -108,13 +108,14 @@ fn scene(size: (u32, u32), n_sources: usize) -> (MvsView, Vec<MvsView>) {
     (view(pose(0.0, 0.0, 0.0, 0.0), size), sources.collect())
 }
 
+const ANY_KIND: Wanted = Wanted {
+    any_kind: true,
+    subgroups: true,
+    float_atomics: false,
+};
+
 fn opened() -> GpuMatcher {
-    let wanted = Wanted {
-        any_kind: true,
-        subgroups: true,
-        float_atomics: false,
-    };
-    GpuMatcher::open(wanted).unwrap_or_else(|error| panic!("run scripts/setup test: {error}"))
+    GpuMatcher::open(ANY_KIND).unwrap_or_else(|error| panic!("run scripts/setup test: {error}"))
 }
 
 fn with_gpu<T>(run: impl FnOnce(&mut GpuMatcher) -> T) -> T {
@@ -305,6 +306,24 @@ fn a_device_lost_in_the_middle_of_a_run_costs_no_depth() {
         let found = matcher.winners(task);
         assert_eq!(found.plane, task.winners_on_cpu().plane);
         assert!(matches!(matcher, Matcher::Cpu), "it does not try again");
+    });
+}
+
+#[test]
+fn the_slower_machine_is_not_taken() {
+    let params = params(64, 2);
+    with_task(&scene((96, 72), 2), RANGE, &params, |task| {
+        let (winners, matcher) = timed(task, ANY_KIND);
+        let is_software = with_gpu(|gpu| gpu.adapter().contains("llvmpipe"));
+        if is_software {
+            // Tens of times slower than native code: no load of the machine turns that round.
+            assert!(matches!(matcher, Matcher::Cpu));
+        }
+        let taken = match matcher {
+            Matcher::Gpu(mut gpu) => gpu.winners(task).unwrap(),
+            _ => task.winners_on_cpu(),
+        };
+        assert_eq!(winners.plane, taken.plane, "of the machine that is kept");
     });
 }
 
