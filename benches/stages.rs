@@ -1,7 +1,7 @@
 //! Time of each stage of a step and of whole steps, 270x480, by number of splats.
 //!
 //! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have. Whole steps also on the GPU,
-//! which may be software, and in maps of which most lies behind the camera.
+//! which may be software, and in maps of which most lies behind the camera. Depth of a view on both.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -14,7 +14,10 @@ use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_mapper::camera::Intrinsics;
+use splat_mapper::config::Settings;
 use splat_mapper::frame::{DepthMap, RgbImage};
+use splat_mapper::geometry::mvs::gpu::GpuMatcher;
+use splat_mapper::geometry::mvs::{self, MvsView};
 use splat_mapper::gpu::device::Wanted;
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
@@ -42,7 +45,7 @@ const MAPS: [(&str, usize); 4] = [
     ("300k", 300_000),
 ];
 
-criterion_group!(benches, stages, gpu_steps, maps);
+criterion_group!(benches, stages, gpu_steps, maps, sweeps);
 criterion_main!(benches);
 
 fn stages(c: &mut Criterion) {
@@ -105,6 +108,55 @@ fn maps(c: &mut Criterion) {
         if let Ok(mut engine) = WgpuEngine::new(wanted) {
             bench_step(c, "step_in_map_wgpu", name, &mut engine, &all, view);
         }
+    }
+}
+
+/// Depth of one view from the multi-view stereo: 320x240, 96 planes, 4 sources.
+fn sweeps(c: &mut Criterion) {
+    let mut params = Settings::shipped().params().expect("shipped").mvs;
+    (params.n_depths, params.n_sources) = (96, 4);
+    let views: Vec<MvsView> = (0..5).map(|ix| noise_view(0.1 * f64::from(ix))).collect();
+    let sources: Vec<&MvsView> = views[1..].iter().collect();
+    let range = (1.0, 6.0);
+    let mut group = c.benchmark_group("sweep_320x240x96_4_sources");
+    configure(&mut group);
+    group.sample_size(10);
+    group.bench_function("cpu", |b| {
+        b.iter(|| mvs::sweep(&views[0], &sources, range, &params));
+    });
+    let wanted = Wanted {
+        any_kind: true,
+        subgroups: true,
+        float_atomics: false,
+    };
+    if let Ok(mut gpu) = GpuMatcher::open(wanted) {
+        group.bench_function("wgpu", |b| {
+            b.iter(|| gpu.sweep(&views[0], &sources, range, &params));
+        });
+    }
+    group.finish();
+}
+
+/// Of noise: matching takes as long whatever there is to see.
+fn noise_view(x: f64) -> MvsView {
+    let (width_px, height_px) = (320, 240);
+    let mut rng = Pcg32::seed_from_u64(3);
+    let pixels = (0..3 * width_px * height_px).map(|_| rng.random());
+    MvsView {
+        image: Arc::new(RgbImage {
+            width_px,
+            height_px,
+            pixels: pixels.collect(),
+        }),
+        intrinsics: Intrinsics {
+            width_px,
+            height_px,
+            fx: 300.0,
+            fy: 300.0,
+            cx: 160.0,
+            cy: 120.0,
+        },
+        world_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
     }
 }
 

@@ -24,9 +24,9 @@ pub mod source;
 
 pub mod select;
 
-pub mod geometry;
-
 pub mod gpu;
+
+pub mod geometry;
 
 pub mod splat;
 

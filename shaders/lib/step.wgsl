@@ -1,5 +1,7 @@
 // What one pass over a picture has to know; the host fills it. Mirrored by gpu/types.rs.
 
+#import flat
+
 struct Step {
     width_px: u32,
     height_px: u32,
@@ -55,11 +57,6 @@ const FLAG_POSE_DIRECT: u32 = 4u;
 const FLAG_POSE_SHARED: u32 = 8u;
 const FLAG_DEPTH: u32 = 16u;
 const FLAG_REFINER: u32 = 32u;
-
-// Dispatches are split over x and y, since one dimension ends at 65,535 groups.
-fn flat(group: vec3<u32>, groups: vec3<u32>) -> u32 {
-    return group.y * groups.x + group.x;
-}
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

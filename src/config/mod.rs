@@ -132,6 +132,7 @@ pub struct MvsParams {
     pub n_depths: usize,
     pub n_sources: usize,
     pub min_views: usize,
+    pub backend: Backend,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

@@ -14,6 +14,7 @@ pub mod two_view;
 
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};
+use crate::gpu::GpuError;
 use crate::pose::Rigid;
 
 /// How far a view can be trusted.
@@ -95,6 +96,10 @@ pub enum GeometryError {
         "known.translation_noise_extent and known.drift_extent are shares of the distance between the outermost true positions, which this source does not know beforehand; use known.translation_noise"
     )]
     NoExtent,
+    #[error(
+        "mvs.backend is wgpu, so that depth is matched on a GPU, and none will do; mvs.backend=cpu needs none: {0}"
+    )]
+    NoGpu(#[from] GpuError),
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
 }

@@ -11,6 +11,7 @@ use bytemuck::Pod;
 
 use crate::gpu::GpuError;
 use crate::gpu::buffer::{Buffer, Meter};
+use crate::gpu::fault::Fault;
 use crate::gpu::kernel::{Access, Kernel, Lanes};
 
 /// A device that has not finished by then never will.
@@ -43,6 +44,7 @@ pub struct Gpu {
     /// By kernel and buffers.
     pub(super) bind_groups: RefCell<HashMap<(&'static str, Vec<u64>), wgpu::BindGroup>>,
     meter: Arc<Meter>,
+    fault: Fault,
 }
 
 /// A compiled kernel.
@@ -149,6 +151,8 @@ impl Gpu {
         let offset = (range.start * size_of::<T>()) as u64;
         encoder.copy_buffer_to_buffer(&buffer.raw, offset, &staging.raw, 0, n_bytes);
         self.queue.submit([encoder.finish()]);
+        // Work that was refused leaves zeros, and waiting for a device that is lost is a panic of wgpu.
+        self.check()?;
         let slice = staging.raw.slice(..n_bytes);
         slice.map_async(wgpu::MapMode::Read, |_| {});
         self.wait()?;
@@ -156,7 +160,19 @@ impl Gpu {
             tracing::error!("reading from {}: {error}", self.name);
             self.hangs()
         })?;
+        self.check()?;
         Ok(bytemuck::pod_collect_to_vec(&view[..]))
+    }
+
+    /// An error once anything was refused or the device was lost.
+    pub fn check(&self) -> Result<(), GpuError> {
+        self.fault.check(&self.name)
+    }
+
+    /// As when the adapter is unplugged.
+    #[cfg(test)]
+    pub(crate) fn lose(&self) {
+        self.device.destroy();
     }
 
     /// Memory that the host can map.
@@ -335,9 +351,7 @@ async fn open(wanted: Wanted) -> Result<Gpu, GpuError> {
                 adapter: info.name.clone(),
                 reason: e.to_string(),
             })?;
-    device.on_uncaptured_error(Arc::new(|error: wgpu::Error| {
-        tracing::error!("the GPU refuses: {error}");
-    }));
+    let fault = Fault::watching(&device);
     let mut name = info.name.clone();
     // Writing to a string cannot fail.
     let _infallible = write!(name, " ({:?}, {})", info.backend, info.driver_info);
@@ -351,6 +365,7 @@ async fn open(wanted: Wanted) -> Result<Gpu, GpuError> {
         pipelines: RefCell::default(),
         bind_groups: RefCell::default(),
         meter: Arc::default(),
+        fault,
     })
 }
 

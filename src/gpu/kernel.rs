@@ -131,7 +131,15 @@ kernels! {
         moves Uniform, sources Read, geometry ReadWrite, sh_rest ReadWrite, moments ReadWrite, sh_moments ReadWrite,
         anchors ReadWrite,
     ];
+    MVS_COST "mvs_cost" 64 [
+        sweep Uniform, luma Read, statistics Read, warps Read, starts Read, costs ReadWrite,
+    ];
+    MVS_PATHS "mvs_paths" 32 [sweep Uniform, costs Read, penalties Read, sums ReadWrite];
+    MVS_WINNER "mvs_winner" 64 [sweep Uniform, costs Read, sums Read, dips ReadWrite];
 }
+
+/// The stages of a sweep of the multi-view stereo; all others serve the splats.
+pub const SWEEP: &[&Kernel] = &[&MVS_COST, &MVS_PATHS, &MVS_WINNER];
 
 macro_rules! libraries {
     ($($name:literal),* $(,)?) => {
@@ -146,6 +154,7 @@ libraries![
     "camera",
     "cleared",
     "depth_map",
+    "flat",
     "groups",
     "lane_sum_shared",
     "lane_sum_subgroup",
@@ -160,6 +169,7 @@ libraries![
     "sorting",
     "ssim",
     "step",
+    "sweep",
     "tile_backward",
     "view",
 ];

@@ -5,6 +5,7 @@
 pub mod buffer;
 pub mod commands;
 pub mod device;
+mod fault;
 pub mod kernel;
 pub mod types;
 
@@ -25,7 +26,7 @@ pub enum GpuError {
         reason: String,
     },
     #[error(
-        "{needed} bytes for {what} are more than the {limit} that adapter {adapter:?} allows in one buffer; fewer splats or --backend cpu"
+        "{needed} bytes for {what} are more than the {limit} that adapter {adapter:?} allows at once; ask for less, or use --backend cpu"
     )]
     TooLarge {
         what: &'static str,
@@ -35,4 +36,6 @@ pub enum GpuError {
     },
     #[error("adapter {adapter:?} did not finish within {secs} s; use --backend cpu")]
     Hangs { adapter: String, secs: u64 },
+    #[error("adapter {adapter:?} gave up: {reason}; use --backend cpu")]
+    GaveUp { adapter: String, reason: String },
 }

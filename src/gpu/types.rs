@@ -1,4 +1,4 @@
-//! Host side of the structs in `shaders/lib/`: same names, order and padding; `tests/it/shaders.rs` compares them.
+//! Host side of the structs in `shaders/lib/`: same names, order and padding; `tests/it/shader_layouts.rs` compares them.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -128,7 +128,43 @@ pub struct Moves {
     pub padding_2: f32,
 }
 
-/// Numbers of `shaders/lib/`; `tests/it/shaders.rs` compares them too.
+/// `Sweep` of `shaders/lib/sweep.wgsl`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Sweep {
+    pub width_px: u32,
+    pub height_px: u32,
+    pub n_planes: u32,
+    pub n_words: u32,
+    pub n_sources: u32,
+    pub small_step: u32,
+    pub noise_variance: f32,
+    pub unseen_zncc: f32,
+}
+
+/// `Warp` of `shaders/lib/sweep.wgsl`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Warp {
+    pub step_x: [f32; 4],
+    pub step_y: [f32; 4],
+    pub width_px: u32,
+    pub height_px: u32,
+    pub first: u32,
+    pub padding_0: u32,
+}
+
+/// `Dip` of `shaders/lib/sweep.wgsl`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Dip {
+    pub plane: u32,
+    pub cost: u32,
+    pub before_at: u32,
+    pub after_second: u32,
+}
+
+/// Numbers of `shaders/lib/`; `tests/it/shader_layouts.rs` compares them too.
 pub const SORT_BLOCK: u32 = 2048;
 pub const SCAN_BLOCK: u32 = 2048;
 pub const ARGS_VISIBLE: u64 = 0;
@@ -136,6 +172,10 @@ pub const ARGS_SORT_VISIBLE: u64 = 4;
 pub const ARGS_INSTANCES: u64 = 8;
 pub const ARGS_SORT_INSTANCES: u64 = 12;
 pub const TILE_PX: u32 = 16;
+pub const SWEEP_WINDOW: u32 = 7;
+pub const SWEEP_TILE_X: u32 = 32;
+pub const SWEEP_TILE_Y: u32 = 16;
+pub const MAX_SWEEP_PLANES: u32 = 512;
 
 /// Places in a view's record, in f32.
 pub const VIEW_QUAT: usize = 0;

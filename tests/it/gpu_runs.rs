@@ -147,6 +147,25 @@ fn a_replay_on_a_gpu_gives_the_same_map_twice() {
 }
 
 #[test]
+fn depth_that_must_be_matched_on_a_gpu_says_when_there_is_none() {
+    let out = tempfile::tempdir().unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_splat-mapper"));
+    command.args(["replay", DEMO, "--backend", "cpu", "--geometry", "sfm"]);
+    command.args(["--set", "mvs.backend=wgpu"]);
+    command.arg("--out").arg(out.path());
+    command.env("VK_DRIVER_FILES", "/nowhere.json");
+    command.env("VK_ICD_FILENAMES", "/nowhere.json");
+    let output = command.output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    let line = stderr.lines().last().unwrap_or_default();
+    assert_eq!(output.status.code(), Some(1), "{line}");
+    assert!(
+        line.contains("mvs.backend=cpu") && line.contains("no GPU adapter answers"),
+        "{line}"
+    );
+}
+
+#[test]
 fn without_a_driver_one_line_says_what_to_install() {
     let out = tempfile::tempdir().unwrap();
     let (code, _, line) = replay(out.path(), Some("/nowhere.json"));

@@ -29,7 +29,7 @@ fn told(shown: &Shown, changes: &[&str]) -> Told {
         .iter()
         .for_each(|change| settings.merge_setting(change).unwrap());
     let params = settings.params().unwrap();
-    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
+    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let mut told = Told {
         views: BTreeMap::new(),
         sightings: BTreeMap::new(),
@@ -166,15 +166,15 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
     sorted[(share * (sorted.len() - 1) as f64) as usize]
 }
 
-/// Bounds of a stereo depth map: median error, share beyond 5 %; `least` of the pixels must be kept.
+/// Median error at most 0.5 %; at least `least` of the pixels kept, at most `far_off` of those off by more than 5 %.
 #[track_caller]
-fn holds(name: &str, (errors, kept): (Vec<f64>, f64), least: f64) {
-    let far_off = errors.iter().filter(|e| **e > 0.05).count() as f64 / errors.len() as f64;
+fn holds(name: &str, (errors, kept): (Vec<f64>, f64), [least, far_off]: [f64; 2]) {
+    let beyond = errors.iter().filter(|e| **e > 0.05).count() as f64 / errors.len() as f64;
     let median = quantile(&errors, 0.5);
-    eprintln!("{name}: kept {kept:.3}, median {median:.5}, beyond 5 %: {far_off:.4}");
+    eprintln!("{name}: kept {kept:.3}, median {median:.5}, beyond 5 %: {beyond:.4}");
     assert!(
-        kept >= least && median <= 0.005 && far_off <= 0.02,
-        "{name}: {kept} kept, median {median}, {far_off} beyond 5 %"
+        kept >= least && median <= 0.005 && beyond <= far_off,
+        "{name}: {kept} kept, median {median}, {beyond} beyond 5 %"
     );
 }
 
@@ -189,12 +189,16 @@ fn a_hall_is_measured_to_half_a_percent() {
             &LENS.resized(w, h),
         )
     };
-    holds("hall", against_truth(&told, &shown, &truth), 0.7);
+    holds("hall", against_truth(&told, &shown, &truth), [0.75, 0.02]);
 }
 
+/// Rooms are full of edges: most that is off by more lies within a pixel of one, where a pixel holds two depths.
 #[test]
-fn made_up_scenes_are_measured_to_half_a_percent() {
-    for scene in [SceneKind::Room, SceneKind::Facade] {
+fn made_up_scenes_are_measured_to_half_a_percent_but_for_edges() {
+    for (scene, bounds) in [
+        (SceneKind::Facade, [0.75, 0.05]),
+        (SceneKind::Room, [0.7, 0.09]),
+    ] {
         let settings = SynthSettings {
             width_px: 480,
             height_px: 360,
@@ -227,7 +231,7 @@ fn made_up_scenes_are_measured_to_half_a_percent() {
         holds(
             &format!("{scene:?}"),
             against_truth(&told, &shown, &truth),
-            0.4,
+            bounds,
         );
     }
 }

@@ -164,7 +164,7 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
         .iter()
         .for_each(|change| settings.merge_setting(change).unwrap());
     let params = settings.params().unwrap();
-    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
+    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let mut poses = std::collections::BTreeMap::new();
     let mut focal_px = f64::NAN;
     let mut take = |out: &SparseBatch| {

@@ -1,17 +1,15 @@
-//! Every shader parses, validates and agrees with the host: table, bindings, workgroups and shared structs.
+//! Every shader parses, validates and agrees with the host's table: files, bindings and workgroups.
 //! Needs no GPU.
 
 use std::collections::BTreeSet;
-use std::mem::{offset_of, size_of};
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::valid::{ShaderStages, SubgroupOperationSet};
-use naga::{AddressSpace, Module, ScalarKind, StorageAccess, TypeInner};
+use naga::{AddressSpace, Module, StorageAccess};
 use splat_mapper::gpu::kernel::{self, ALL, Access, Kernel, LIB, Lanes, PROJECT};
-use splat_mapper::gpu::types::{self, Camera, Moves, Projected, SortPass, Step};
 
 /// Without and with subgroups, as adapters have them.
-const LANES: [Lanes; 4] = [
+pub const LANES: [Lanes; 4] = [
     Lanes {
         n: 32,
         are_subgroup: false,
@@ -32,7 +30,7 @@ const LANES: [Lanes; 4] = [
 /// What WebGPU guarantees to every stage, and to a uniform.
 const MAX_STORAGE_BINDINGS: usize = 8;
 
-fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
+pub fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
     let text = kernel
         .text(lanes)
         .ok_or("an #import names no file of shaders/lib, or a #repeat has no end")?;
@@ -109,67 +107,6 @@ fn faults(kernel: &Kernel, lanes: Lanes) -> Result<(), String> {
     }
 }
 
-/// (name, offset, WGSL type) of each field, and the size.
-type Layout = (Vec<(String, usize, String)>, usize);
-
-fn wgsl_layout(module: &Module, name: &str) -> Layout {
-    let (_, ty) = module
-        .types
-        .iter()
-        .find(|(_, ty)| ty.name.as_deref() == Some(name))
-        .unwrap();
-    let TypeInner::Struct { members, span } = &ty.inner else {
-        panic!("{name} is no struct")
-    };
-    let fields = members.iter().map(|member| {
-        let ty = match &module.types[member.ty].inner {
-            TypeInner::Scalar(scalar) => scalar_name(scalar.kind).to_owned(),
-            TypeInner::Vector { size, scalar } => {
-                format!("{}x{}", scalar_name(scalar.kind), *size as u8)
-            }
-            other => panic!("{other:?} is not shared with the host"),
-        };
-        (member.name.clone().unwrap(), member.offset as usize, ty)
-    });
-    (fields.collect(), *span as usize)
-}
-
-fn scalar_name(kind: ScalarKind) -> &'static str {
-    match kind {
-        ScalarKind::Float => "f32",
-        ScalarKind::Uint => "u32",
-        ScalarKind::Sint => "i32",
-        other => panic!("{other:?} is not shared with the host"),
-    }
-}
-
-/// The WGSL type of a host type.
-trait Wgsl {
-    const NAME: &'static str;
-}
-impl Wgsl for f32 {
-    const NAME: &'static str = "f32";
-}
-impl Wgsl for u32 {
-    const NAME: &'static str = "u32";
-}
-impl Wgsl for [f32; 2] {
-    const NAME: &'static str = "f32x2";
-}
-impl Wgsl for [f32; 4] {
-    const NAME: &'static str = "f32x4";
-}
-
-fn type_of<S, T: Wgsl>(_: fn(&S) -> &T) -> String {
-    T::NAME.to_owned()
-}
-
-macro_rules! host_layout {
-    ($ty:ty, $($field:ident),+) => {
-        (vec![$((stringify!($field).to_owned(), offset_of!($ty, $field), type_of(|s: &$ty| &s.$field))),+], size_of::<$ty>())
-    };
-}
-
 #[test]
 fn every_shader_is_valid_and_as_the_table_says() {
     for lanes in LANES {
@@ -199,177 +136,6 @@ fn the_table_lists_every_file() {
         files("shaders/lib"),
         LIB.iter().map(|(name, _)| (*name).to_owned()).collect()
     );
-}
-
-#[test]
-fn the_step_has_the_layout_of_the_host() {
-    let step: Layout = host_layout!(
-        Step,
-        width_px,
-        height_px,
-        n_tiles_x,
-        n_tiles_y,
-        n_splats,
-        max_instances,
-        view_ix,
-        n_steps,
-        sh_degree,
-        sh_stored,
-        sh_interval,
-        flags,
-        depth_mode,
-        depth_width,
-        depth_height,
-        lr_mean,
-        lr_scale,
-        lr_quat,
-        lr_opacity,
-        lr_sh0,
-        lr_sh_rest,
-        lr_rotation,
-        lr_translation,
-        lr_refiner,
-        lr_focal,
-        lr_exposure,
-        noise,
-        noise_seed,
-        ssim_weight,
-        depth_weight,
-        opacity_reg,
-        scale_reg,
-        mask_sum,
-        confidence_sum,
-        camera_scale,
-        epipolar_rho_x,
-        epipolar_rho_y,
-        epipolar_rho_z,
-        epipolar_theta_x,
-        epipolar_theta_y,
-        epipolar_theta_z
-    );
-    assert_eq!(layout_in("Step", &PROJECT), step);
-}
-
-fn layout_in(name: &str, kernel: &Kernel) -> Layout {
-    wgsl_layout(&module(kernel, LANES[0]).unwrap(), name)
-}
-
-#[test]
-fn other_shared_structs_have_the_layout_of_the_host() {
-    let camera: Layout = host_layout!(
-        Camera,
-        rotation_x,
-        rotation_y,
-        rotation_z,
-        translation,
-        center,
-        pinhole,
-        slope_bounds,
-        gain,
-        offset,
-        n_visible,
-        n_instances,
-        is_full,
-        n_wanted,
-        n_done,
-        padding_0,
-        padding_1,
-        padding_2
-    );
-    assert_eq!(layout_in("Camera", &PROJECT), camera);
-    let projected: Layout = host_layout!(
-        Projected,
-        center_px,
-        depth,
-        opacity,
-        conic_a,
-        conic_b,
-        conic_c,
-        splat_ix,
-        red,
-        green,
-        blue,
-        cut,
-        extent_px,
-        n_tiles,
-        first_instance
-    );
-    assert_eq!(layout_in("Projected", &PROJECT), projected);
-    let sort_pass: Layout = host_layout!(SortPass, shift, padding_0, padding_1, padding_2);
-    assert_eq!(layout_in("SortPass", &kernel("sort_count")), sort_pass);
-    let moves: Layout = host_layout!(
-        Moves,
-        n_splats,
-        n_added,
-        seed,
-        kind,
-        weight_bits,
-        active_steps,
-        n_steps,
-        sh_stored,
-        min_opacity,
-        padding_0,
-        padding_1,
-        padding_2
-    );
-    assert_eq!(layout_in("Moves", &kernel("move_draw")), moves);
-}
-
-fn kernel(name: &str) -> Kernel {
-    let found = ALL.iter().find(|kernel| kernel.name == name).unwrap();
-    Kernel { ..**found }
-}
-
-#[test]
-fn shared_numbers_are_those_of_the_host() {
-    let check = |name: &str, constant: &str, expected: u64| {
-        let module = module(&kernel(name), LANES[0]).unwrap();
-        let found = module
-            .constants
-            .iter()
-            .find(|(_, found)| found.name.as_deref() == Some(constant))
-            .map(|(_, found)| &module.global_expressions[found.init]);
-        let Some(naga::Expression::Literal(naga::Literal::U32(found))) = found else {
-            panic!("{constant} of {name} is {found:?}");
-        };
-        assert_eq!(u64::from(*found), expected, "{constant}");
-    };
-    check("sort_count", "SORT_BLOCK", u64::from(types::SORT_BLOCK));
-    check("scan_sums", "SCAN_BLOCK", u64::from(types::SCAN_BLOCK));
-    check("project", "TILE_PX", u64::from(types::TILE_PX));
-    for (constant, expected) in [
-        ("ARGS_VISIBLE", types::ARGS_VISIBLE),
-        ("ARGS_SORT_VISIBLE", types::ARGS_SORT_VISIBLE),
-        ("ARGS_INSTANCES", types::ARGS_INSTANCES),
-        ("ARGS_SORT_INSTANCES", types::ARGS_SORT_INSTANCES),
-    ] {
-        check("instance_args", constant, expected);
-    }
-    for (constant, expected) in [
-        ("VIEW_QUAT", types::VIEW_QUAT),
-        ("VIEW_TRANSLATION", types::VIEW_TRANSLATION),
-        ("VIEW_PINHOLE", types::VIEW_PINHOLE),
-        ("VIEW_EXPOSURE", types::VIEW_EXPOSURE),
-        ("VIEW_POSE_M", types::VIEW_POSE_M),
-        ("VIEW_POSE_AGE", types::VIEW_POSE_AGE),
-        ("VIEW_EMBEDDING_AGE", types::VIEW_EMBEDDING_AGE),
-        ("VIEW_EMBEDDING", types::VIEW_EMBEDDING),
-        ("VIEW_STRIDE", types::VIEW_STRIDE),
-        ("NET_SIZE", types::NET_SIZE),
-        ("LOG_FOCAL", types::LOG_FOCAL),
-    ] {
-        check("update_view", constant, expected as u64);
-    }
-    for (constant, expected) in [
-        ("FLAG_TRAIN_SPLATS", types::FLAG_TRAIN_SPLATS),
-        ("FLAG_GRADIENTS", types::FLAG_GRADIENTS),
-        ("FLAG_POSE_DIRECT", types::FLAG_POSE_DIRECT),
-        ("FLAG_POSE_SHARED", types::FLAG_POSE_SHARED),
-        ("FLAG_DEPTH", types::FLAG_DEPTH),
-        ("FLAG_REFINER", types::FLAG_REFINER),
-    ] {
-        check("update_view", constant, u64::from(expected));
-    }
 }
 
 #[test]

@@ -3,12 +3,17 @@
 //! Knows nothing of how the poses came about. Lengths are in whatever unit the poses use.
 
 mod consistency;
+mod edges;
+pub mod gpu;
 mod grey;
+mod matcher;
 pub mod neighbours;
 mod planes;
 mod sgm;
 pub mod state;
 mod sweep;
+#[cfg(test)]
+mod tests;
 mod zncc;
 
 use std::sync::Arc;
@@ -40,28 +45,27 @@ pub struct RawDepth {
     pub margin: Vec<f32>,
 }
 
-/// Depth of `reference` by matching it against `sources`, between the planes `near` and `far`.
+/// Depth of `reference` by matching it against `sources`, between the planes `near` and `far`, on the CPU.
 ///
 /// Empty (all 0) where nothing can be told: no usable source, no parallax, an impossible range.
 pub fn sweep(
     reference: &MvsView,
     sources: &[&MvsView],
-    near: f64,
-    far: f64,
+    (near, far): (f64, f64),
     params: &MvsParams,
 ) -> RawDepth {
     let reference = Prepared::new(reference, params);
-    let sources: Vec<Prepared> = sources
-        .iter()
-        .map(|source| Prepared::new(source, params))
-        .collect();
-    sweep_prepared(
-        &reference,
-        &sources.iter().collect::<Vec<_>>(),
-        near,
-        far,
-        params,
-    )
+    let sources = prepared(sources, params);
+    let sources: Vec<&Prepared> = sources.iter().collect();
+    match Task::new(&reference, &sources, (near, far), params) {
+        Some(task) => task.raw_depth(task.winners_on_cpu()),
+        None => RawDepth::empty(reference.intrinsics),
+    }
+}
+
+fn prepared(views: &[&MvsView], params: &MvsParams) -> Vec<Prepared> {
+    let views = views.iter();
+    views.map(|view| Prepared::new(view, params)).collect()
 }
 
 /// Keeps the depths that at least `params.min_views` of `others` agree with; all other confidences are 0.
@@ -111,44 +115,59 @@ impl Prepared {
 /// Two matching windows; smaller pictures hold no depth worth having.
 const MIN_SIDE_PX: usize = 2 * zncc::WINDOW;
 
-fn sweep_prepared(
-    reference: &Prepared,
-    sources: &[&Prepared],
-    near: f64,
-    far: f64,
-    params: &MvsParams,
-) -> RawDepth {
-    let empty = RawDepth::empty(reference.intrinsics);
-    let range_fits = near.is_finite() && far.is_finite() && near > 0.0 && far > near * 1.000_1;
-    if !range_fits || !reference.is_usable() {
-        return empty;
+/// A sweep that can tell something: a reference with planes, and sources that see parallax between them.
+#[derive(Debug)]
+struct Task<'a> {
+    reference: &'a Prepared,
+    warps: Vec<sweep::Warp<'a>>,
+    planes: planes::Planes,
+}
+
+impl<'a> Task<'a> {
+    /// `None`: nothing can be told.
+    fn new(
+        reference: &'a Prepared,
+        sources: &[&'a Prepared],
+        (near, far): (f64, f64),
+        params: &MvsParams,
+    ) -> Option<Self> {
+        let range_fits = near.is_finite() && far.is_finite() && near > 0.0 && far > near * 1.000_1;
+        if !range_fits || !reference.is_usable() {
+            return None;
+        }
+        let planes = planes::Planes {
+            inverse_near: 1.0 / near,
+            inverse_far: 1.0 / far,
+            n: params.n_depths.max(3),
+        };
+        let warps: Vec<sweep::Warp<'_>> = sources
+            .iter()
+            .filter(|source| source.is_usable())
+            .filter_map(|source| sweep::Warp::new(reference, source, &planes))
+            .take(params.n_sources)
+            .collect();
+        (!warps.is_empty()).then_some(Self {
+            reference,
+            warps,
+            planes,
+        })
     }
-    let planes = planes::Planes {
-        inverse_near: 1.0 / near,
-        inverse_far: 1.0 / far,
-        n: params.n_depths.max(3),
-    };
-    let warps: Vec<sweep::Warp<'_>> = sources
-        .iter()
-        .filter(|source| source.is_usable())
-        .filter_map(|source| sweep::Warp::new(reference, source, &planes))
-        .take(params.n_sources)
-        .collect();
-    if warps.is_empty() {
-        return empty;
+
+    fn winners_on_cpu(&self) -> sgm::Winners {
+        let costs = sweep::matching_costs(&self.reference.grey, &self.warps, &self.planes);
+        sgm::best_planes(&self.reference.grey, &costs, self.planes.n)
     }
-    let costs = sweep::matching_costs(&reference.grey, &warps, &planes);
-    let winners = sgm::best_planes(&reference.grey, &costs, planes.n);
-    let depth = winners
-        .plane
-        .iter()
-        .map(|&plane| planes.depth(plane))
-        .collect();
-    RawDepth {
-        intrinsics: reference.intrinsics,
-        depth,
-        score: winners.score,
-        margin: winners.margin,
+
+    fn raw_depth(&self, winners: sgm::Winners) -> RawDepth {
+        let depths = winners.plane.iter().map(|plane| self.planes.depth(*plane));
+        let mut depth: Vec<f32> = depths.collect();
+        edges::settle(self.reference, &self.warps, &mut depth);
+        RawDepth {
+            intrinsics: self.reference.intrinsics,
+            depth,
+            score: winners.score,
+            margin: winners.margin,
+        }
     }
 }
 

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::grey::Grey;
 
 /// Penalty for a step of one plane, in units of the cost (255 = no match at all).
-const SMALL_STEP: u16 = 10;
+pub(super) const SMALL_STEP: u16 = 10;
 /// Penalty for any larger jump where the picture is even; an edge in the picture divides it.
 const LARGE_STEP: f32 = 90.0;
 const LARGE_STEP_MIN: u16 = 24;
@@ -60,13 +60,12 @@ pub(super) fn best_planes(grey: &Grey, costs: &[u8], n_planes: usize) -> Winners
             for x in 0..width {
                 let at = (y * width + x) * n_planes..(y * width + x + 1) * n_planes;
                 add_into(&mut total, &down[at.clone()], &up[at.clone()]);
-                let Some(winner) = winner_of(&total) else {
+                let Some(dip) = dip_of(&total) else {
                     continue;
                 };
-                let cost = costs[at.start + winner.plane];
-                plane[x] = winner.plane as f32 + winner.offset;
-                score[x] = 1.0 - f32::from(cost) / 255.0;
-                margin[x] = winner.margin;
+                plane[x] = dip.fractional_plane();
+                score[x] = score_of(costs[at.start + dip.plane]);
+                margin[x] = dip.margin();
             }
         });
     winners
@@ -78,45 +77,67 @@ fn add_into(total: &mut [u16], a: &[u16], b: &[u16]) {
     }
 }
 
-struct Winner {
-    plane: usize,
-    /// Minimum of the parabola through the three sums, -0.5 to 0.5.
-    offset: f32,
-    margin: f32,
-}
-
 /// `None` when the first or last plane wins: the surface lies outside of the range.
-fn winner_of(total: &[u16]) -> Option<Winner> {
+fn dip_of(total: &[u16]) -> Option<Dip> {
     let lowest = lowest_of(total);
     let plane = total.iter().position(|&sum| sum == lowest)?;
     if plane == 0 || plane + 1 == total.len() {
         return None;
     }
-    let (before, at, after) = (
-        f32::from(total[plane - 1]),
-        f32::from(lowest),
-        f32::from(total[plane + 1]),
-    );
-    let curvature = before + after - 2.0 * at;
-    let offset = if curvature > 0.0 {
-        0.5 * (before - after) / curvature
-    } else {
-        0.0
-    };
-    let second = lowest_of(&total[..plane - 1]).min(lowest_of(&total[plane + 2..]));
-    let margin = if second == u16::MAX {
-        0.0
-    } else {
-        (f32::from(second) - at) / f32::from(second).max(1.0)
-    };
-    Some(Winner {
+    Some(Dip {
         plane,
-        offset: offset.clamp(-0.5, 0.5),
-        margin,
+        before: total[plane - 1],
+        lowest,
+        after: total[plane + 1],
+        second: lowest_of(&total[..plane - 1]).min(lowest_of(&total[plane + 2..])),
     })
 }
 
-fn jump_penalty(luma: f32, previous: f32) -> u16 {
+/// The lowest sum of a pixel, neither on the first plane nor on the last.
+#[derive(Debug)]
+pub(super) struct Dip {
+    pub(super) plane: usize,
+    /// Sums on the planes beside it.
+    pub(super) before: u16,
+    pub(super) lowest: u16,
+    pub(super) after: u16,
+    /// Lowest sum beyond those; the largest number where there is none.
+    pub(super) second: u16,
+}
+
+impl Dip {
+    /// Fractional plane: the minimum of the parabola through the three sums.
+    pub(super) fn fractional_plane(&self) -> f32 {
+        let (before, at, after) = (
+            f32::from(self.before),
+            f32::from(self.lowest),
+            f32::from(self.after),
+        );
+        let curvature = before + after - 2.0 * at;
+        let offset = if curvature > 0.0 {
+            0.5 * (before - after) / curvature
+        } else {
+            0.0
+        };
+        self.plane as f32 + offset.clamp(-0.5, 0.5)
+    }
+
+    /// How far it stands out, 0 to 1.
+    pub(super) fn margin(&self) -> f32 {
+        if self.second == u16::MAX {
+            return 0.0;
+        }
+        let second = f32::from(self.second);
+        (second - f32::from(self.lowest)) / second.max(1.0)
+    }
+}
+
+/// ZNCC that a cost stands for.
+pub(super) fn score_of(cost: u8) -> f32 {
+    1.0 - f32::from(cost) / 255.0
+}
+
+pub(super) fn jump_penalty(luma: f32, previous: f32) -> u16 {
     let penalty = LARGE_STEP / (1.0 + (luma - previous).abs() / EDGE_LUMA);
     (penalty as u16).max(LARGE_STEP_MIN)
 }

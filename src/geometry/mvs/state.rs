@@ -4,17 +4,20 @@ use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3};
 
+use super::matcher::Matcher;
 use super::neighbours::{Candidate, choose_sources};
-use super::{MvsView, Prepared, RawDepth, consistency, sweep_prepared};
+use super::{MvsView, Prepared, RawDepth, Task, consistency};
 use crate::camera::Intrinsics;
 use crate::config::MvsParams;
 use crate::frame::DepthMap;
+use crate::gpu::GpuError;
 use crate::pose::Rigid;
 
 /// Grey pictures and raw depth of the newest keyframes: about 1 MB each at 320 pixels.
 #[derive(Debug)]
 pub struct MvsState {
     params: MvsParams,
+    matcher: Matcher,
     max_keyframes: usize,
     held: BTreeMap<u32, Held>,
     n_sweeps: u64,
@@ -45,13 +48,15 @@ const MAX_VERIFIERS: usize = 8;
 const MAX_LANDMARKS: usize = 200;
 
 impl MvsState {
-    pub fn new(params: MvsParams, max_keyframes: usize) -> Self {
-        Self {
+    /// An error where the parameters insist on a GPU and there is none.
+    pub fn new(params: MvsParams, max_keyframes: usize) -> Result<Self, GpuError> {
+        Ok(Self {
+            matcher: Matcher::new(params.backend)?,
             params,
             max_keyframes: max_keyframes.max(1),
             held: BTreeMap::new(),
             n_sweeps: 0,
-        }
+        })
     }
 
     /// Matches `view` against those `neighbours` that are held. Without any, the view is held all the same and can
@@ -100,7 +105,10 @@ impl MvsState {
             .collect();
         let pictures: Vec<&Prepared> = sources.iter().map(|(_, prepared)| *prepared).collect();
         tracing::debug!(keyframe_id, n_sources = sources.len(), near, far, "sweep");
-        let raw = sweep_prepared(reference, &pictures, near, far, &self.params);
+        let raw = match Task::new(reference, &pictures, (near, far), &self.params) {
+            Some(task) => task.raw_depth(self.matcher.winners(&task)),
+            None => RawDepth::empty(reference.intrinsics),
+        };
         let sources = sources
             .iter()
             .map(|(id, source)| Source {
@@ -188,6 +196,11 @@ impl MvsState {
         self.held
             .get(&keyframe_id)
             .map_or(0, |held| held.sources.len())
+    }
+
+    #[cfg(test)]
+    pub(super) fn matcher(&self) -> &Matcher {
+        &self.matcher
     }
 
     pub fn holds(&self, keyframe_id: u32) -> bool {

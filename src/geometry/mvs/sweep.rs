@@ -21,7 +21,7 @@ const MIN_TRAVEL_PX: f64 = 1.5;
 pub(super) struct Warp<'a> {
     pub(super) source: &'a Grey,
     /// Columns for x, y and 1. Pixel index space on both sides: centres at integers.
-    pixel_map: [[f64; 3]; 3],
+    pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
 }
 
@@ -73,7 +73,7 @@ impl<'a> Warp<'a> {
         longest
     }
 
-    fn homogeneous(&self, x: f64, y: f64, inverse_depth: f64) -> glam::DVec3 {
+    pub(super) fn homogeneous(&self, x: f64, y: f64, inverse_depth: f64) -> glam::DVec3 {
         let column = |ix: usize| glam::DVec3::from_array(self.pixel_map[ix]);
         column(0) * x
             + column(1) * y

@@ -19,10 +19,10 @@ const TO_INTEGER: f32 = 8_388_608.0;
 
 /// Variance of a pixel that is noise only, squared luma: about one grey level after averaging. It pulls the ZNCC of
 /// blank walls to 0, where smoothness decides, instead of letting noise decide.
-const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
+pub(super) const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
 
 /// Cost of a plane that no source sees: as bad as a ZNCC of this.
-const UNSEEN_ZNCC: f32 = 0.2;
+pub(super) const UNSEEN_ZNCC: f32 = 0.2;
 
 /// Homogeneous source pixels along one row of the reference.
 pub(super) struct WarpedRow {
@@ -30,16 +30,17 @@ pub(super) struct WarpedRow {
     pub(super) step: [f32; 3],
 }
 
-fn padded(width: usize) -> usize {
+/// Length of a row.
+pub(super) fn padded(width: usize) -> usize {
     width.next_multiple_of(BLOCK)
 }
 
 /// Sums over the window around each reference pixel, cut off at the border of the picture; rows are padded.
 pub(super) struct Statistics {
-    sum: Vec<f32>,
+    pub(super) sum: Vec<f32>,
     /// n * variance + noise.
-    spread: Vec<f32>,
-    one_over_n: Vec<f32>,
+    pub(super) spread: Vec<f32>,
+    pub(super) one_over_n: Vec<f32>,
 }
 
 impl Statistics {

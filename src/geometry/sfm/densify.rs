@@ -9,6 +9,7 @@ use crate::geometry::mvs::MvsView;
 use crate::geometry::mvs::neighbours::depth_range;
 use crate::geometry::mvs::state::MvsState;
 use crate::geometry::{GeometryBatch, PoseError, Sightings, View};
+use crate::gpu::GpuError;
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 96;
@@ -23,11 +24,11 @@ pub(super) struct Densifier {
 }
 
 impl Densifier {
-    pub(super) fn new(params: &MvsParams) -> Self {
-        Self {
+    pub(super) fn new(params: &MvsParams) -> Result<Self, GpuError> {
+        Ok(Self {
             params: params.clone(),
-            state: MvsState::new(params.clone(), MAX_HELD),
-        }
+            state: MvsState::new(params.clone(), MAX_HELD)?,
+        })
     }
 
     /// `image_of` gives the picture of a keyframe.

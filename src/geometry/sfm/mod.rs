@@ -69,16 +69,17 @@ pub struct Sfm {
 }
 
 impl Sfm {
-    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
-        Self {
+    /// An error where the parameters insist on a GPU for the stereo and there is none.
+    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
+        Ok(Self {
             sfm: sfm.clone(),
-            densifier: Densifier::new(mvs),
+            densifier: Densifier::new(mvs)?,
             seed,
             scene: Scene::default(),
             told: Told::default(),
             batch_id: 0,
             last_start: None,
-        }
+        })
     }
 
     /// Takes a batch; keyframes seen before are only reported again.

@@ -9,7 +9,7 @@ use super::scene::Component;
 use super::{Sfm, SparseBatch};
 use crate::config::{MvsParams, SfmParams};
 use crate::frame::Batch;
-use crate::geometry::GeometryBatch;
+use crate::geometry::{GeometryBatch, GeometryError};
 use crate::pose::Rigid;
 
 /// Stereo for a stream of keyframes whose poses are given, all in one frame.
@@ -19,10 +19,11 @@ pub struct PosedStereo {
 }
 
 impl PosedStereo {
-    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
-        let mut sfm = Sfm::new(sfm, mvs, seed);
+    /// An error where the parameters insist on a GPU and there is none.
+    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
+        let mut sfm = Sfm::new(sfm, mvs, seed)?;
         sfm.scene.components.push(Component::default());
-        Self { sfm }
+        Ok(Self { sfm })
     }
 
     /// Views of all keyframes of the batch that have a pose in `batch_from_cam` (by keyframe id) and intrinsics.

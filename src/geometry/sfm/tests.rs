@@ -94,7 +94,7 @@ fn arc(n: usize, from_deg: f64, to_deg: f64) -> Vec<Rigid> {
 
 fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (Sfm, SparseBatch) {
     let params = Settings::shipped().params().unwrap();
-    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
+    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let image = Arc::new(RgbImage {
         width_px: SIZE.0,
         height_px: SIZE.1,
@@ -282,7 +282,7 @@ fn equal_input_gives_equal_poses() {
 #[test]
 fn blank_tiny_and_broken_pictures_are_survived() {
     let params = Settings::shipped().params().unwrap();
-    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1);
+    let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let picture = |id: u32, width_px: u32, height_px: u32, n: usize| {
         let image = Arc::new(RgbImage {
             width_px,

@@ -54,7 +54,9 @@ impl WgpuEngine {
     pub fn new(wanted: Wanted) -> Result<Self, GpuError> {
         let gpu = Gpu::open(wanted)?;
         let is_fit = |kernel: &&Kernel| {
-            gpu.has_float_atomics() || kernel.name != kernel::RASTER_BACKWARD_ATOMIC.name
+            let is_sweep = kernel::SWEEP.iter().any(|other| other.name == kernel.name);
+            let is_atomic = kernel.name == kernel::RASTER_BACKWARD_ATOMIC.name;
+            !is_sweep && (gpu.has_float_atomics() || !is_atomic)
         };
         let kernels: Vec<_> = kernel::ALL.iter().copied().filter(is_fit).collect();
         gpu.compile(&kernels)?;
