@@ -56,7 +56,7 @@ impl Known {
             params,
             seed,
             extent: extent.unwrap_or(0.0),
-            stereo: PosedStereo::new(sfm, mvs, seed),
+            stereo: PosedStereo::new(sfm, mvs, seed)?,
             disturbed: BTreeMap::new(),
         })
     }

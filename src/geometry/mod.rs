@@ -97,6 +97,8 @@ pub enum GeometryError {
     NoExtent,
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
+    #[error(transparent)]
+    Features(#[from] features::FeaturesError),
 }
 
 /// Estimates cameras and depth. One thread owns it; calls come in order of batches.

@@ -122,7 +122,7 @@ fn model(
 ) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
     match params.geometry.as_str() {
         "sfm" => Ok((
-            Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)),
+            Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
             ScaleSource::UpToScale,
         )),
         "known" => Ok((

@@ -35,7 +35,7 @@ use self::starting::{Start, start};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, SfmParams};
 use crate::frame::{Batch, Keyframe};
-use crate::geometry::features::{Features, features, working_picture, working_size};
+use crate::geometry::features::{Features, FeaturesError, Finder, working_picture, working_size};
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
@@ -60,6 +60,7 @@ pub(crate) struct Limits {
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
+    finder: Finder,
     densifier: Densifier,
     seed: u64,
     scene: Scene,
@@ -69,16 +70,17 @@ pub struct Sfm {
 }
 
 impl Sfm {
-    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
-        Self {
+    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, FeaturesError> {
+        Ok(Self {
             sfm: sfm.clone(),
+            finder: Finder::new(sfm)?,
             densifier: Densifier::new(mvs),
             seed,
             scene: Scene::default(),
             told: Told::default(),
             batch_id: 0,
             last_start: None,
-        }
+        })
     }
 
     /// Takes a batch; keyframes seen before are only reported again.
@@ -131,7 +133,7 @@ impl Sfm {
         let looked = |keyframe: &&Arc<Keyframe>| {
             let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
             (
-                features(&picture, self.sfm.max_features),
+                self.finder.features(&picture, self.sfm.max_features),
                 (picture.width as u32, picture.height as u32),
             )
         };

@@ -10,6 +10,7 @@ use super::{Sfm, SparseBatch};
 use crate::config::{MvsParams, SfmParams};
 use crate::frame::Batch;
 use crate::geometry::GeometryBatch;
+use crate::geometry::features::FeaturesError;
 use crate::pose::Rigid;
 
 /// Stereo for a stream of keyframes whose poses are given, all in one frame.
@@ -19,10 +20,10 @@ pub struct PosedStereo {
 }
 
 impl PosedStereo {
-    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Self {
-        let mut sfm = Sfm::new(sfm, mvs, seed);
+    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, FeaturesError> {
+        let mut sfm = Sfm::new(sfm, mvs, seed)?;
         sfm.scene.components.push(Component::default());
-        Self { sfm }
+        Ok(Self { sfm })
     }
 
     /// Views of all keyframes of the batch that have a pose in `batch_from_cam` (by keyframe id) and intrinsics.
