@@ -1,5 +1,7 @@
 //! Time of each stage of a step and of whole steps, 270x480, by number of splats.
 //!
+//! And of features by kind: a random picture of 640x360 on all cores, and one pair of 2,000 descriptors on one.
+//!
 //! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have. Whole steps also on the GPU,
 //! which may be software, and in maps of which most lies behind the camera. Depth of a view on both.
 
@@ -16,8 +18,11 @@ use rand_pcg::Pcg32;
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::config::Settings;
 use splat_mapper::frame::{DepthMap, RgbImage};
+use splat_mapper::geometry::features::{Features, orb, sift};
+use splat_mapper::geometry::matching::{Comparable, matches};
 use splat_mapper::geometry::mvs::gpu::GpuMatcher;
 use splat_mapper::geometry::mvs::{self, MvsView};
+use splat_mapper::geometry::scale_space::Grey;
 use splat_mapper::gpu::device::Wanted;
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
@@ -45,7 +50,7 @@ const MAPS: [(&str, usize); 4] = [
     ("300k", 300_000),
 ];
 
-criterion_group!(benches, stages, gpu_steps, maps, sweeps);
+criterion_group!(benches, stages, gpu_steps, maps, sweeps, features);
 criterion_main!(benches);
 
 fn stages(c: &mut Criterion) {
@@ -157,6 +162,38 @@ fn noise_view(x: f64) -> MvsView {
             cy: 120.0,
         },
         world_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
+    }
+}
+
+fn features(c: &mut Criterion) {
+    const N: usize = 2_000;
+    let mut rng = Pcg32::seed_from_u64(3);
+    let (width, height) = (640, 360);
+    let mut picture = Grey {
+        width,
+        height,
+        pixels: vec![0.5; width * height],
+    };
+    for _ in 0..4_000 {
+        let (x, y) = (rng.random_range(0..width), rng.random_range(0..height));
+        let (size, step) = (rng.random_range(2..30), rng.random_range(-0.2..0.2_f32));
+        for row in y..(y + size).min(height) {
+            picture.pixels[row * width..][x..(x + size).min(width)]
+                .iter_mut()
+                .for_each(|v| *v = (*v + step).clamp(0.0, 1.0));
+        }
+    }
+    type Find = fn(&Grey, usize) -> Features;
+    for (kind, find) in [("sift", sift::features as Find), ("orb", orb::features)] {
+        let mut group = c.benchmark_group(format!("features_{kind}"));
+        configure(&mut group);
+        group.bench_function("640x360", |b| b.iter(|| find(black_box(&picture), N)));
+        group.finish();
+        let found = Comparable::new(&find(&picture, N).descriptors);
+        let mut group = c.benchmark_group(format!("matches_{kind}"));
+        configure(&mut group);
+        group.bench_function("2000", |b| b.iter(|| matches(&found, black_box(&found))));
+        group.finish();
     }
 }
 

@@ -18,6 +18,10 @@ pub mod atomic;
 
 pub mod frame;
 
+pub mod libraries;
+
+pub mod onnx;
+
 pub mod ros;
 
 pub mod source;

@@ -3,6 +3,7 @@
 //! The embedded file is the only home of defaults and ranges: the structs below have neither. A user's file or
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
+mod file;
 mod range;
 
 use std::collections::BTreeMap;
@@ -11,6 +12,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::config::file::{flatten, parse_file};
 use crate::config::range::{Range, ranges_of_comments};
 
 /// Named sets of values in `launch/presets`.
@@ -114,9 +116,20 @@ pub struct KnownParams {
     pub depth_noise: f64,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FeatureKind {
+    Auto,
+    Sift,
+    Orb,
+    Xfeat,
+}
+
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SfmParams {
+    pub features: FeatureKind,
+    pub xfeat_model: String,
     pub max_features: usize,
     pub max_side: u32,
     pub min_inliers: usize,
@@ -359,39 +372,6 @@ impl Settings {
         by_tail
             .or_else(|| self.values.keys().find(|known| known.contains(tail)))
             .cloned()
-    }
-}
-
-/// YAML text -> the tree under `splat_mapper/ros__parameters` (or under `/**`, as ROS 2 allows).
-fn parse_file(text: &str) -> Result<Value, String> {
-    let root: Value = serde_saphyr::from_str(text).map_err(|e| e.to_string())?;
-    let node = root.get("splat_mapper").or_else(|| root.get("/**"));
-    let node = node.ok_or("no top-level key splat_mapper")?;
-    let tree = node
-        .get("ros__parameters")
-        .ok_or("no key ros__parameters under the node's name")?;
-    if tree.is_object() {
-        Ok(tree.clone())
-    } else {
-        Err("ros__parameters holds no keys".to_owned())
-    }
-}
-
-fn flatten(prefix: &str, tree: &Value, out: &mut BTreeMap<String, Value>) {
-    match tree {
-        Value::Object(entries) => {
-            for (name, value) in entries {
-                let key = if prefix.is_empty() {
-                    name.clone()
-                } else {
-                    format!("{prefix}.{name}")
-                };
-                flatten(&key, value, out);
-            }
-        }
-        leaf => {
-            out.insert(prefix.to_owned(), leaf.clone());
-        }
     }
 }
 

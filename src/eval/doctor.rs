@@ -5,10 +5,9 @@
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use super::lpips::ONNX_RUNTIME_FIX;
-use super::machine::{
-    cpu_features, entries, find_library, free_disk_mib, free_memory_mib, icd_files, library_folders,
-};
+use super::machine::{cpu_features, free_disk_mib, free_memory_mib, icd_files};
+use crate::libraries::{entries, find_library, library_folders};
+use crate::onnx::ONNX_RUNTIME_FIX;
 
 /// A run over some hundred keyframes stays below this.
 const NEEDED_MEMORY_MIB: f64 = 2048.0;
@@ -285,7 +284,7 @@ fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
         Some(path) => Check::ok("onnx runtime", path.display().to_string()),
         None => Check::optional(
             "onnx runtime",
-            "none; only eval.lpips_model needs it (and onnx:FILE geometry in a later version)",
+            "none; only eval.lpips_model and sfm.features=xfeat need it (and onnx:FILE geometry in a later version)",
             ONNX_RUNTIME_FIX,
         ),
     }

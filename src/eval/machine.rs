@@ -1,6 +1,8 @@
 //! Looking at the machine: files, folders, the environment. Knows nothing of what is good or bad.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+
+use crate::libraries::entries;
 
 #[cfg(target_arch = "x86_64")]
 pub fn cpu_features() -> Vec<&'static str> {
@@ -24,41 +26,6 @@ pub fn cpu_features() -> Vec<&'static str> {
     }
 }
 
-pub fn library_folders() -> Vec<PathBuf> {
-    const STANDARD: [&str; 9] = [
-        "/usr/local/lib",
-        "/usr/lib/x86_64-linux-gnu",
-        "/usr/lib/aarch64-linux-gnu",
-        "/usr/lib64",
-        "/usr/lib",
-        "/lib/x86_64-linux-gnu",
-        "/lib/aarch64-linux-gnu",
-        "/lib64",
-        "/lib",
-    ];
-    let named = std::env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
-    std::env::split_paths(&named)
-        .filter(|path| !path.as_os_str().is_empty())
-        .chain(STANDARD.map(PathBuf::from))
-        .collect()
-}
-
-/// The library itself or a versioned name of it.
-pub fn find_library(folders: &[PathBuf], name: &str) -> Option<PathBuf> {
-    let matches = |path: &PathBuf| {
-        let file = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        file.strip_prefix(name)
-            .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
-    };
-    folders
-        .iter()
-        .find_map(|folder| entries(folder).into_iter().find(matches))
-}
-
 /// Vulkan's driver manifests, where its loader looks for them.
 pub fn icd_files() -> Vec<PathBuf> {
     let named =
@@ -80,18 +47,6 @@ pub fn icd_files() -> Vec<PathBuf> {
         .flat_map(|folder| entries(&folder.join("vulkan/icd.d")))
         .filter(is_manifest)
         .collect()
-}
-
-/// Sorted content of a folder; nothing when it is not there.
-pub fn entries(folder: &Path) -> Vec<PathBuf> {
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.path())
-        .collect();
-    paths.sort();
-    paths
 }
 
 /// Of the machine, or of the container where that has less.

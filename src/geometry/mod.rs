@@ -102,6 +102,8 @@ pub enum GeometryError {
     NoGpu(#[from] GpuError),
     #[error("{name:?} is no geometry; expected sfm or known")]
     UnknownModel { name: String },
+    #[error(transparent)]
+    Features(#[from] features::FeaturesError),
 }
 
 /// Estimates cameras and depth. One thread owns it; calls come in order of batches.

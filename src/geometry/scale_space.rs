@@ -31,6 +31,8 @@ pub struct Octave {
     /// Input pixels per pixel of this octave.
     pub step: f32,
     pub layers: Vec<Grey>,
+    /// `differences[i]` is layer i + 1 less layer i.
+    pub differences: Vec<Grey>,
 }
 
 /// A blob: place in its octave's pixels (centres at integers), layer and blur.
@@ -46,39 +48,37 @@ pub struct Blob {
 }
 
 impl Grey {
+    /// Whether there are as many pixels as the size says.
+    pub fn is_whole(&self) -> bool {
+        self.pixels.len() == self.width * self.height
+    }
+
     pub fn at(&self, x: usize, y: usize) -> f32 {
         self.pixels[y * self.width + x]
     }
 
-    /// Bilinear, clamped to the border; integer coordinates are pixel centres.
-    #[inline]
-    pub fn sample(&self, x: f32, y: f32) -> f32 {
-        let x = x.clamp(0.0, (self.width - 1) as f32);
-        let y = y.clamp(0.0, (self.height - 1) as f32);
-        let (x0, y0) = (x as usize, y as usize);
-        let (fx, fy) = (x - x0 as f32, y - y0 as f32);
-        let (x1, y1) = ((x0 + 1).min(self.width - 1), (y0 + 1).min(self.height - 1));
-        let (top, bottom) = (y0 * self.width, y1 * self.width);
-        let p = &self.pixels;
-        let a = p[top + x0] + fx * (p[top + x1] - p[top + x0]);
-        let b = p[bottom + x0] + fx * (p[bottom + x1] - p[bottom + x0]);
-        a + fy * (b - a)
-    }
-
+    /// Linear between the centres of the pixels.
     fn doubled(&self) -> Self {
-        let (width, height) = (self.width * 2, self.height * 2);
-        let mut pixels = vec![0.0; width * height];
+        let (w, h) = (self.width, self.height);
+        let row_of = |y: usize| &self.pixels[y.min(h - 1) * w..][..w];
+        let mut pixels = vec![0.0; 4 * w * h];
         pixels
-            .par_chunks_mut(width)
+            .par_chunks_mut(2 * w)
             .enumerate()
-            .for_each(|(y, row)| {
-                for (x, out) in row.iter_mut().enumerate() {
-                    *out = self.sample((x as f32 + 0.5) * 0.5 - 0.5, (y as f32 + 0.5) * 0.5 - 0.5);
-                }
+            .for_each_init(Vec::new, |mixed, (y, out)| {
+                let near = row_of(y / 2);
+                let far = row_of(if y % 2 == 0 {
+                    (y / 2).saturating_sub(1)
+                } else {
+                    y / 2 + 1
+                });
+                mixed.clear();
+                mixed.extend(near.iter().zip(far).map(|(a, b)| 0.75 * a + 0.25 * b));
+                double_row(mixed, out);
             });
         Self {
-            width,
-            height,
+            width: 2 * w,
+            height: 2 * h,
             pixels,
         }
     }
@@ -86,34 +86,63 @@ impl Grey {
     /// Every second pixel.
     fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
-        let rows = (0..height).flat_map(|y| (0..width).map(move |x| (2 * x, 2 * y)));
+        let rows = self.pixels.chunks_exact(self.width).step_by(2).take(height);
+        let pixels = rows
+            .flat_map(|row| row.chunks_exact(2).map(|pair| pair[0]))
+            .collect();
         Self {
             width,
             height,
-            pixels: rows.map(|(x, y)| self.at(x, y)).collect(),
+            pixels,
         }
     }
 
-    fn blurred(&self, sigma: f32) -> Self {
-        let kernel = gaussian(sigma);
-        let radius = kernel.len() / 2;
+    /// A Gaussian down and then along each row, while the row is in the first cache.
+    pub fn blurred(&self, sigma: f32) -> Self {
+        let kernel = half_gaussian(sigma);
+        let radius = kernel.len() - 1;
         let (w, h) = (self.width, self.height);
-        let mut across = vec![0.0_f32; w * h];
-        across
-            .par_chunks_mut(w)
-            .zip(self.pixels.par_chunks(w))
-            .for_each(|(out, row)| blur_row(row, &kernel, out));
         let mut pixels = vec![0.0_f32; w * h];
-        pixels.par_chunks_mut(w).enumerate().for_each(|(y, out)| {
-            let row_of = |k: usize| mirrored(y as isize + k as isize - radius as isize, h) * w;
-            let rows: Vec<&[f32]> = (0..kernel.len())
-                .map(|k| &across[row_of(k)..row_of(k) + w])
-                .collect();
-            weighted_sum(&rows, &kernel, out);
-        });
+        let padded = || vec![0.0_f32; w + 2 * radius];
+        pixels
+            .par_chunks_mut(w)
+            .enumerate()
+            .for_each_init(padded, |padded, (y, out)| {
+                let row_of = |by: isize| &self.pixels[mirrored(y as isize + by, h) * w..][..w];
+                let pairs: Vec<[&[f32]; 2]> = (0..=radius as isize)
+                    .map(|k| [row_of(-k), row_of(k)])
+                    .collect();
+                weighted_sum(&pairs, &kernel, &mut padded[radius..radius + w]);
+                for i in 1..=radius {
+                    padded[radius - i] = padded[radius + mirrored(-(i as isize), w)];
+                    padded[radius + w - 1 + i] = padded[radius + mirrored((w - 1 + i) as isize, w)];
+                }
+                let shifted: Vec<[&[f32]; 2]> = (0..=radius)
+                    .map(|k| [&padded[radius - k..][..w], &padded[radius + k..][..w]])
+                    .collect();
+                weighted_sum(&shifted, &kernel, out);
+            });
         Self {
             width: w,
             height: h,
+            pixels,
+        }
+    }
+
+    fn minus(&self, other: &Self) -> Self {
+        let mut pixels = vec![0.0; self.pixels.len()];
+        pixels
+            .par_chunks_mut(self.width)
+            .zip(self.pixels.par_chunks(self.width))
+            .zip(other.pixels.par_chunks(self.width))
+            .for_each(|((out, a), b)| {
+                for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
+                    *out = a - b;
+                }
+            });
+        Self {
+            width: self.width,
+            height: self.height,
             pixels,
         }
     }
@@ -126,13 +155,19 @@ pub fn pyramid(picture: &Grey) -> Vec<Octave> {
     let mut octaves = Vec::new();
     let mut step = 0.5;
     while base.width.min(base.height) >= 24 && octaves.len() < 8 {
-        let mut layers = vec![base];
+        let (mut layers, mut differences) = (vec![base], Vec::new());
         for i in 1..LAYERS + 3 {
             let grown = layer_sigma(i).powi(2) - layer_sigma(i - 1).powi(2);
-            layers.push(layers[i - 1].blurred(grown.sqrt()));
+            let next = layers[i - 1].blurred(grown.sqrt());
+            differences.push(next.minus(&layers[i - 1]));
+            layers.push(next);
         }
         base = layers[LAYERS].halved();
-        octaves.push(Octave { step, layers });
+        octaves.push(Octave {
+            step,
+            layers,
+            differences,
+        });
         step *= 2.0;
     }
     octaves
@@ -148,34 +183,19 @@ pub fn blobs(octaves: &[Octave]) -> Vec<Blob> {
 }
 
 fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
-    let (w, h) = (octave.layers[0].width, octave.layers[0].height);
-    let differences: Vec<Grey> = octave
-        .layers
-        .par_windows(2)
-        .map(|pair| {
-            let pixels = pair[1]
-                .pixels
-                .iter()
-                .zip(&pair[0].pixels)
-                .map(|(a, b)| a - b)
-                .collect();
-            Grey {
-                width: w,
-                height: h,
-                pixels,
-            }
-        })
-        .collect();
+    let differences = &octave.differences;
+    let (w, h) = (differences[0].width, differences[0].height);
     let rows =
         (1..=LAYERS).flat_map(|layer| (BORDER..h.saturating_sub(BORDER)).map(move |y| (layer, y)));
     let rows: Vec<(usize, usize)> = rows.collect();
     let found: Vec<Vec<Blob>> = rows
         .par_iter()
-        .map(|&(layer, y)| {
-            let candidates =
-                (BORDER..w - BORDER).filter(|&x| is_extremum(&differences, layer, x, y));
+        .map_init(Vec::new, |is_peak, &(layer, y)| {
+            peaks_of_row(&differences[layer], y, is_peak);
+            let candidates = (BORDER..w - BORDER)
+                .filter(|&x| is_peak[x] != 0 && is_extremum(differences, layer, x, y));
             candidates
-                .filter_map(|x| refined(&differences, layer, x, y))
+                .filter_map(|x| refined(differences, layer, x, y))
                 .map(|b| Blob {
                     octave: octave_ix,
                     ..b
@@ -186,17 +206,52 @@ fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
     found.into_iter().flatten().collect()
 }
 
+/// Marks the pixels of a row that are clear enough and beaten by none of their eight neighbours.
+#[multiversion::multiversion(targets("x86_64+avx2", "aarch64+neon"))]
+fn peaks_of_row(difference: &Grey, y: usize, is_peak: &mut Vec<u32>) {
+    let w = difference.width;
+    is_peak.clear();
+    is_peak.resize(w, 0);
+    let n = w - 2;
+    let row = |y: usize, from: usize| &difference.pixels[y * w + from..][..n];
+    let (a, b, c) = (row(y - 1, 0), row(y - 1, 1), row(y - 1, 2));
+    let (d, e, f) = (row(y, 0), row(y, 1), row(y, 2));
+    let (g, h, i) = (row(y + 1, 0), row(y + 1, 1), row(y + 1, 2));
+    for (x, out) in is_peak[1..=n].iter_mut().enumerate() {
+        let high = a[x]
+            .max(b[x])
+            .max(c[x].max(d[x]))
+            .max(f[x].max(g[x]).max(h[x].max(i[x])));
+        let low = a[x]
+            .min(b[x])
+            .min(c[x].min(d[x]))
+            .min(f[x].min(g[x]).min(h[x].min(i[x])));
+        let is_high = (e[x] >= high) & (e[x] >= 0.5 * MIN_CONTRAST);
+        let is_low = (e[x] <= low) & (e[x] <= -0.5 * MIN_CONTRAST);
+        *out = u32::from(is_high | is_low);
+    }
+}
+
 fn layer_sigma(layer: usize) -> f32 {
     BASE_SIGMA * (layer as f32 / LAYERS as f32).exp2()
 }
 
-fn gaussian(sigma: f32) -> Vec<f32> {
+/// The middle and one side of a Gaussian.
+fn half_gaussian(sigma: f32) -> Vec<f32> {
     let radius = (3.5 * sigma).ceil() as i32;
-    let raw: Vec<f32> = (-radius..=radius)
+    let raw: Vec<f32> = (0..=radius)
         .map(|x| (-0.5 * (x as f32 / sigma).powi(2)).exp())
         .collect();
-    let sum: f32 = raw.iter().sum();
+    let sum: f32 = raw[0] + 2.0 * raw[1..].iter().sum::<f32>();
     raw.iter().map(|v| v / sum).collect()
+}
+
+fn double_row(row: &[f32], out: &mut [f32]) {
+    let last = row.len() - 1;
+    for (x, pair) in out.chunks_exact_mut(2).enumerate() {
+        pair[0] = 0.75 * row[x] + 0.25 * row[x.saturating_sub(1)];
+        pair[1] = 0.75 * row[x] + 0.25 * row[(x + 1).min(last)];
+    }
 }
 
 fn mirrored(i: isize, n: usize) -> usize {
@@ -211,45 +266,40 @@ fn mirrored(i: isize, n: usize) -> usize {
     folded.clamp(0, n - 1) as usize
 }
 
-fn blur_row(row: &[f32], kernel: &[f32], out: &mut [f32]) {
-    let (w, radius) = (row.len(), kernel.len() / 2);
-    let padded: Vec<f32> = (0..w + 2 * radius)
-        .map(|i| row[mirrored(i as isize - radius as isize, w)])
-        .collect();
-    let shifted: Vec<&[f32]> = (0..kernel.len()).map(|k| &padded[k..k + w]).collect();
-    weighted_sum(&shifted, kernel, out);
-}
+/// Pixels of a row that stay in registers while all rows are added to them.
+const STRETCH: usize = 64;
 
-/// Most of the time of finding features goes here.
+/// The first weight counts once, every other one for both rows of its pair.
 #[multiversion::multiversion(targets("x86_64+avx2", "aarch64+neon"))]
-fn weighted_sum(rows: &[&[f32]], weights: &[f32], out: &mut [f32]) {
-    // A short stretch of the output stays in registers while all rows are added to it.
-    const STRETCH: usize = 32;
+fn weighted_sum(pairs: &[[&[f32]; 2]], weights: &[f32], out: &mut [f32]) {
     let n = out.len();
-    for start in (0..n - n % STRETCH).step_by(STRETCH) {
-        let mut sum = [0.0_f32; STRETCH];
-        for (row, &weight) in rows.iter().zip(weights) {
-            for (s, &v) in sum.iter_mut().zip(&row[start..start + STRETCH]) {
-                *s += weight * v;
+    if n < STRETCH {
+        for i in 0..n {
+            out[i] = weights[0] * pairs[0][0][i];
+            for ([a, b], weight) in pairs.iter().zip(weights).skip(1) {
+                out[i] += weight * (a[i] + b[i]);
+            }
+        }
+        return;
+    }
+    // The last stretch covers some pixels a second time.
+    let starts = (0..n - STRETCH).step_by(STRETCH).chain([n - STRETCH]);
+    for start in starts {
+        let middle = &pairs[0][0][start..start + STRETCH];
+        let mut sum: [f32; STRETCH] = std::array::from_fn(|i| weights[0] * middle[i]);
+        for ([a, b], &weight) in pairs.iter().zip(weights).skip(1) {
+            let (a, b) = (&a[start..start + STRETCH], &b[start..start + STRETCH]);
+            for i in 0..STRETCH {
+                sum[i] += weight * (a[i] + b[i]);
             }
         }
         out[start..start + STRETCH].copy_from_slice(&sum);
-    }
-    for i in n - n % STRETCH..n {
-        out[i] = rows
-            .iter()
-            .zip(weights)
-            .map(|(row, weight)| weight * row[i])
-            .sum();
     }
 }
 
 fn is_extremum(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
     let w = differences[layer].width;
     let centre = differences[layer].pixels[y * w + x];
-    if centre.abs() < 0.5 * MIN_CONTRAST {
-        return false;
-    }
     let beats = |other: f32| {
         if centre > 0.0 {
             centre >= other

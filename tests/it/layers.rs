@@ -117,7 +117,7 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
             &["src/select", "src/geometry/", "src/source/"][..],
         ),
         ("kornia_3d", &["src/geometry/"][..]),
-        ("ort", &["src/eval/lpips.rs"][..]),
+        ("ort", &["src/onnx.rs"][..]),
         ("wgpu", &["src/gpu/"][..]),
         ("multiversion", &["src/splat/cpu/", "src/geometry/"][..]),
     ])

@@ -13,7 +13,7 @@ const INT: u64 = 2;
 
 /// The library that scripts/setup test put into target/onnxruntime, or the one that is named. Without it: fails under
 /// CI=true, else says so, and the test returns.
-fn library() -> Option<PathBuf> {
+pub(crate) fn library() -> Option<PathBuf> {
     let named = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
     let folder = Path::new("target/onnxruntime/onnxruntime/capi");
     let is_library = |path: &PathBuf| {
@@ -80,7 +80,7 @@ fn tensor(field: u64, name: &str, sides: &[&str]) -> Vec<u8> {
 }
 
 /// Mean of |a - b| over `inputs` pictures named a, b, ...: with one input, of |a|.
-fn network(inputs: &[&str]) -> Vec<u8> {
+pub(crate) fn network(inputs: &[&str]) -> Vec<u8> {
     let keep_no_sides = [bytes(1, b"keepdims"), number(3, 0), number(20, INT)].concat();
     let mut graph = match inputs {
         [one] => node("Abs", &[one], "size", &[]),
@@ -105,7 +105,7 @@ fn network(inputs: &[&str]) -> Vec<u8> {
     [number(1, 8), bytes(7, &graph), bytes(8, &opset)].concat()
 }
 
-fn saved(folder: &Path, content: &[u8]) -> PathBuf {
+pub(crate) fn saved(folder: &Path, content: &[u8]) -> PathBuf {
     let path = folder.join("lpips.onnx");
     std::fs::write(&path, content).unwrap();
     path

@@ -54,3 +54,4 @@ mod synthetic;
 mod synthetic_source;
 mod topics;
 mod trajectory;
+mod xfeat;

@@ -274,6 +274,23 @@ fn fox_is_registered_whole_in_one_frame() {
 }
 
 #[test]
+fn fox_is_registered_whole_by_corners() {
+    let Some(folder) = scene("fox") else { return };
+    let settings = ["sfm.max_side=480", "sfm.features=orb"];
+    let figures = run(&shown(&folder, 480, 1, true), &settings);
+    eprintln!("fox by ORB: {figures:?}");
+    // Measured: 0.107 % and 0.111 deg.
+    assert!(
+        figures.registered >= 48 && figures.components == 1,
+        "{figures:?}"
+    );
+    assert!(
+        figures.ate_percent <= 0.3 && figures.rotation_deg <= 0.4,
+        "{figures:?}"
+    );
+}
+
+#[test]
 fn a_camera_at_rest_places_nothing_and_says_why() {
     let Some(folder) = scene("static_euroc") else {
         return;

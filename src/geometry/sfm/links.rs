@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::scene::{Link, Scene, Shot};
 use crate::geometry::features::Features;
-use crate::geometry::matching::{Wide, matches};
+use crate::geometry::matching::{Comparable, matches};
 use crate::geometry::two_view::{fundamental, motion};
 
 /// Shots just before a new one that are always compared with it.
@@ -22,15 +22,11 @@ const MAX_ASKED: usize = 600;
 const MIN_LINK: usize = 15;
 
 /// The coarsest descriptors of a picture: they survive the largest changes of view.
-pub(super) fn signature(features: &Features) -> Wide {
+pub(super) fn signature(features: &Features) -> Comparable {
     let mut order: Vec<usize> = (0..features.len()).collect();
     order.sort_by(|&a, &b| features.sigmas[b].total_cmp(&features.sigmas[a]));
-    let picked: Vec<_> = order
-        .iter()
-        .take(SIGNATURE)
-        .map(|&i| features.descriptors[i])
-        .collect();
-    Wide::new(&picked)
+    order.truncate(SIGNATURE);
+    Comparable::new(&features.descriptors.picked(&order))
 }
 
 /// Links the newest shot (the last) to earlier ones.
@@ -73,11 +69,12 @@ fn alike(scene: &Scene, shot_ix: usize, pool: usize) -> Vec<usize> {
 }
 
 fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, seed: u64) {
-    let wide = Wide::new(&scene.shots[shot_ix].features.descriptors);
+    let ours = Comparable::new(&scene.shots[shot_ix].features.descriptors);
     // The first component settles the focal length; from then on the stricter check is possible.
     let focal_known = !scene.components.is_empty();
     let compare = |&other: &usize| {
-        let raw = matches(&Wide::new(&scene.shots[other].features.descriptors), &wide);
+        let theirs = Comparable::new(&scene.shots[other].features.descriptors);
+        let raw = matches(&theirs, &ours);
         let link = verified(
             &scene.shots[other],
             &scene.shots[shot_ix],

@@ -35,7 +35,7 @@ use self::starting::{Start, start};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, SfmParams};
 use crate::frame::{Batch, Keyframe};
-use crate::geometry::features::{Features, features, working_picture, working_size};
+use crate::geometry::features::{Features, Finder, working_picture, working_size};
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
@@ -60,6 +60,7 @@ pub(crate) struct Limits {
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
+    finder: Finder,
     densifier: Densifier,
     seed: u64,
     scene: Scene,
@@ -69,10 +70,11 @@ pub struct Sfm {
 }
 
 impl Sfm {
-    /// An error where the parameters insist on a GPU for the stereo and there is none.
+    /// An error where the parameters insist on a GPU or a network that is not there.
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
         Ok(Self {
             sfm: sfm.clone(),
+            finder: Finder::new(sfm)?,
             densifier: Densifier::new(mvs)?,
             seed,
             scene: Scene::default(),
@@ -132,7 +134,7 @@ impl Sfm {
         let looked = |keyframe: &&Arc<Keyframe>| {
             let picture = working_picture(&keyframe.frame.image, self.sfm.max_side);
             (
-                features(&picture, self.sfm.max_features),
+                self.finder.features(&picture, self.sfm.max_features),
                 (picture.width as u32, picture.height as u32),
             )
         };

@@ -19,7 +19,7 @@ pub struct PosedStereo {
 }
 
 impl PosedStereo {
-    /// An error where the parameters insist on a GPU and there is none.
+    /// An error where the parameters insist on a GPU or a network that is not there.
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
         let mut sfm = Sfm::new(sfm, mvs, seed)?;
         sfm.scene.components.push(Component::default());

@@ -10,7 +10,7 @@ use glam::{DVec2, DVec3};
 use crate::camera::Intrinsics;
 use crate::frame::{Keyframe, RgbImage};
 use crate::geometry::features::Features;
-use crate::geometry::matching::Wide;
+use crate::geometry::matching::Comparable;
 use crate::geometry::triangulate::Sight;
 use crate::pose::{Rigid, Similarity};
 
@@ -22,7 +22,7 @@ pub(super) struct Shot {
     pub(super) keyframe: Arc<Keyframe>,
     pub(super) features: Features,
     /// The coarsest features, for finding pictures of the same place.
-    pub(super) signature: Wide,
+    pub(super) signature: Comparable,
     pub(super) lens: Intrinsics,
     pub(super) is_calibrated: bool,
     pub(super) placed: Option<Placed>,

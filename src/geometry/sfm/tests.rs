@@ -8,7 +8,7 @@ use super::*;
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::Settings;
 use crate::frame::{Frame, RgbImage};
-use crate::geometry::features::{Descriptor, Features};
+use crate::geometry::features::{Descriptors, Features};
 use crate::pose::Rigid;
 
 const SIZE: (u32, u32) = (640, 480);
@@ -26,7 +26,7 @@ fn camera() -> Intrinsics {
 
 struct World {
     points: Vec<DVec3>,
-    descriptors: Vec<Descriptor>,
+    descriptors: Vec<[u64; 4]>,
     rng: Pcg32,
 }
 
@@ -34,9 +34,7 @@ impl World {
     fn new(n: usize, mut point: impl FnMut(&mut Pcg32) -> DVec3) -> Self {
         let mut rng = Pcg32::seed_from_u64(7);
         let points = (0..n).map(|_| point(&mut rng)).collect();
-        let descriptors = (0..n)
-            .map(|_| std::array::from_fn(|_| rng.random_range(0..90)))
-            .collect();
+        let descriptors = (0..n).map(|_| rng.random()).collect();
         Self {
             points,
             descriptors,
@@ -48,6 +46,7 @@ impl World {
     fn seen_from(&mut self, world_from_cam: &Rigid) -> Features {
         let cam_from_world = world_from_cam.inverse();
         let mut out = Features::default();
+        let mut descriptors = Vec::new();
         for i in 0..self.points.len() {
             let Some(pixel) = camera().project(cam_from_world.transform_point(self.points[i]))
             else {
@@ -66,9 +65,10 @@ impl World {
                 };
                 out.pixels.push(pixel + noise);
                 out.sigmas.push(2.0);
-                out.descriptors.push(self.descriptors[named]);
+                descriptors.push(self.descriptors[named]);
             }
         }
+        out.descriptors = Descriptors::Orb(descriptors);
         out
     }
 }

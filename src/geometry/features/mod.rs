@@ -1,0 +1,173 @@
+//! A picture -> distinctive points with descriptors, of the kind that `sfm.features` names.
+//!
+//! Knows nothing of cameras or other pictures.
+
+pub mod orb;
+pub mod sift;
+pub mod xfeat;
+
+use std::path::{Path, PathBuf};
+
+use fast_image_resize as fir;
+
+use self::xfeat::Xfeat;
+use crate::config::{FeatureKind, SfmParams};
+use crate::frame::RgbImage;
+use crate::geometry::scale_space::Grey;
+use crate::onnx::OnnxError;
+
+/// Length of every SIFT descriptor: with 16 bits for a product, 256 is the most there is, and rounding takes some.
+pub const SIFT_LENGTH: f32 = 250.0;
+/// Length of every XFeat descriptor; their products have a sign.
+pub const XFEAT_LENGTH: f32 = 176.0;
+
+/// Of one picture, in the order of its points.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Descriptors {
+    Sift(Vec<[u8; 128]>),
+    Orb(Vec<[u64; 4]>),
+    Xfeat(Vec<[i16; 64]>),
+}
+
+impl Default for Descriptors {
+    fn default() -> Self {
+        Self::Sift(Vec::new())
+    }
+}
+
+impl Descriptors {
+    /// Those with the given numbers.
+    pub fn picked(&self, numbers: &[usize]) -> Self {
+        match self {
+            Self::Sift(all) => Self::Sift(numbers.iter().map(|&i| all[i]).collect()),
+            Self::Orb(all) => Self::Orb(numbers.iter().map(|&i| all[i]).collect()),
+            Self::Xfeat(all) => Self::Xfeat(numbers.iter().map(|&i| all[i]).collect()),
+        }
+    }
+}
+
+/// Points of one picture, the strongest first.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Features {
+    /// In pixels of the working picture, centres at +0.5.
+    pub pixels: Vec<glam::DVec2>,
+    /// Size of what was found, in pixels of the working picture; only the order means anything across kinds.
+    pub sigmas: Vec<f32>,
+    pub descriptors: Descriptors,
+}
+
+impl Features {
+    pub fn len(&self) -> usize {
+        self.pixels.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.pixels.is_empty()
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum FeaturesError {
+    #[error(
+        "sfm.features=xfeat needs a network; set sfm.xfeat_model to an ONNX file of XFeat (docs/FORMATS.md has the contract)"
+    )]
+    NoModel,
+    #[error("sfm.features=xfeat: {0}")]
+    Onnx(#[from] OnnxError),
+    #[error("sfm.xfeat_model is no XFeat network: {reason}; docs/FORMATS.md has the contract: {}", path.display())]
+    Model { reason: String, path: PathBuf },
+}
+
+/// Finds features of one kind.
+#[derive(Debug)]
+pub enum Finder {
+    Sift,
+    Orb,
+    Xfeat(Box<Xfeat>),
+}
+
+impl Finder {
+    pub fn new(params: &SfmParams) -> Result<Self, FeaturesError> {
+        match params.features {
+            FeatureKind::Auto | FeatureKind::Sift => Ok(Self::Sift),
+            FeatureKind::Orb => Ok(Self::Orb),
+            FeatureKind::Xfeat if params.xfeat_model.is_empty() => Err(FeaturesError::NoModel),
+            FeatureKind::Xfeat => {
+                let network = Xfeat::open(Path::new(&params.xfeat_model))?;
+                Ok(Self::Xfeat(Box::new(network)))
+            }
+        }
+    }
+
+    /// At most `max_features` points of a picture. Pictures too small for the kind, and broken ones, have none.
+    pub fn features(&self, picture: &Grey, max_features: usize) -> Features {
+        match self {
+            Self::Sift => sift::features(picture, max_features),
+            Self::Orb => orb::features(picture, max_features),
+            Self::Xfeat(network) => network.features(picture, max_features),
+        }
+    }
+}
+
+/// The grey picture that features are found on: the longer side is at most `max_side`.
+pub fn working_picture(image: &RgbImage, max_side: u32) -> Grey {
+    let luma = |p: &[u8]| {
+        (77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) as f32
+            / (256.0 * 255.0)
+    };
+    let (w, h) = (image.width_px, image.height_px);
+    let pixels: Vec<f32> = image.pixels.chunks_exact(3).map(luma).collect();
+    let full = Grey {
+        width: w as usize,
+        height: h as usize,
+        pixels,
+    };
+    let (small_w, small_h) = working_size(w, h, max_side);
+    if (small_w, small_h) == (w, h) || !full.is_whole() {
+        return full;
+    }
+    resized(&full, small_w, small_h).unwrap_or(full)
+}
+
+pub fn working_size(width_px: u32, height_px: u32, max_side: u32) -> (u32, u32) {
+    let longest = width_px.max(height_px);
+    if longest <= max_side {
+        return (width_px, height_px);
+    }
+    let scaled = |side: u32| {
+        ((f64::from(side) * f64::from(max_side) / f64::from(longest)).round() as u32).max(1)
+    };
+    (scaled(width_px), scaled(height_px))
+}
+
+/// `None` where one of the sizes is zero.
+fn resized(full: &Grey, width: u32, height: u32) -> Option<Grey> {
+    let source = fir::images::ImageRef::new(
+        full.width as u32,
+        full.height as u32,
+        bytemuck::cast_slice(&full.pixels),
+        fir::PixelType::F32,
+    )
+    .ok()?;
+    let mut pixels = vec![0.0_f32; width as usize * height as usize];
+    let mut target = fir::images::Image::from_slice_u8(
+        width,
+        height,
+        bytemuck::cast_slice_mut(&mut pixels),
+        fir::PixelType::F32,
+    )
+    .ok()?;
+    let options =
+        fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Hamming));
+    fir::Resizer::new()
+        .resize(&source, &mut target, &options)
+        .ok()?;
+    Some(Grey {
+        width: width as usize,
+        height: height as usize,
+        pixels,
+    })
+}
+
+#[cfg(test)]
+mod tests;
