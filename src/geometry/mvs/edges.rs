@@ -141,19 +141,30 @@ impl Support {
         }
     }
 
+    /// The window is small enough for the way to the source to count as affine in it.
     fn zncc_in(&self, warp: &Warp<'_>, [x, y]: [usize; 2], inverse_depth: f64) -> Option<f32> {
-        let corner = warp
-            .homogeneous(
-                x as f64 - RADIUS as f64,
-                y as f64 - RADIUS as f64,
-                inverse_depth,
-            )
-            .as_vec3();
-        let [right, down] = [0, 1].map(|k| glam::DVec3::from_array(warp.pixel_map[k]).as_vec3());
+        let place =
+            |dx: f64, dy: f64| warp.pixel_in_source(x as f64 + dx, y as f64 + dy, inverse_depth);
+        let centre = place(0.0, 0.0)?;
+        let reach = RADIUS as f64;
+        let (right, down) = (place(reach, 0.0)? - centre, place(0.0, reach)? - centre);
+        let (width, height) = (warp.source.width as f64, warp.source.height as f64);
+        let spread = right.abs() + down.abs();
+        let (low, high) = (centre - spread, centre + spread);
+        if low.x < 0.0 || low.y < 0.0 || high.x >= width - 1.0 || high.y >= height - 1.0 {
+            return None;
+        }
+        let (right, down) = (
+            right.as_vec2() / RADIUS as f32,
+            down.as_vec2() / RADIUS as f32,
+        );
+        let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
         let mut seen = [0.0_f32; SIDE * SIDE];
-        for (k, value) in seen.iter_mut().enumerate() {
-            let at = corner + right * (k % SIDE) as f32 + down * (k / SIDE) as f32;
-            *value = warp.source.sample(at)?;
+        for (row, values) in seen.chunks_exact_mut(SIDE).enumerate() {
+            let start = corner + down * row as f32;
+            for (column, value) in values.iter_mut().enumerate() {
+                *value = warp.source.sample(start + right * column as f32);
+            }
         }
         let mean: f32 = self.weights.iter().zip(&seen).map(|(w, v)| w * v).sum();
         let (mut variance, mut covariance) = (NOISE_VARIANCE, 0.0);

@@ -67,26 +67,21 @@ impl Grey {
         }
     }
 
-    /// Bilinear at a homogeneous pixel (centres at integers); `None` outside of the picture or behind the camera.
-    pub(super) fn sample(&self, at: glam::Vec3) -> Option<f32> {
-        let over = 1.0 / at.z;
-        let (u, v) = (at.x * over, at.y * over);
-        let (last_x, last_y) = ((self.width - 1) as f32, (self.height - 1) as f32);
-        let inside =
-            at.z > 1e-6 && u >= -0.5 && v >= -0.5 && u <= last_x + 0.5 && v <= last_y + 0.5;
-        if !inside {
-            return None;
-        }
-        let (u, v) = (u.clamp(0.0, last_x), v.clamp(0.0, last_y));
-        let (x, y) = (
-            (u as usize).min(self.width - 2),
-            (v as usize).min(self.height - 2),
+    /// Bilinear; centres at integers, beyond the outermost centres as at them.
+    pub(super) fn sample(&self, at: glam::Vec2) -> f32 {
+        let (last_x, last_y) = (self.width - 2, self.height - 2);
+        // Negative numbers become 0.
+        let (x, y) = ((at.x as usize).min(last_x), (at.y as usize).min(last_y));
+        let share_x = (at.x - x as f32).clamp(0.0, 1.0);
+        let share_y = (at.y - y as f32).clamp(0.0, 1.0);
+        let from = y * self.width + x;
+        let (upper, lower) = (
+            &self.values[from..from + 2],
+            &self.values[from + self.width..from + self.width + 2],
         );
-        let (share_x, share_y) = (u - x as f32, v - y as f32);
-        let (upper, lower) = (&self.row(y)[x..x + 2], &self.row(y + 1)[x..x + 2]);
         let above = upper[0] + (upper[1] - upper[0]) * share_x;
         let below = lower[0] + (lower[1] - lower[0]) * share_x;
-        Some(above + (below - above) * share_y)
+        above + (below - above) * share_y
     }
 
     pub(super) fn row(&self, y: usize) -> &[f32] {

@@ -81,7 +81,12 @@ impl<'a> Warp<'a> {
             + glam::DVec3::from_array(self.shift) * inverse_depth
     }
 
-    fn pixel_in_source(&self, x: f64, y: f64, inverse_depth: f64) -> Option<glam::DVec2> {
+    pub(super) fn pixel_in_source(
+        &self,
+        x: f64,
+        y: f64,
+        inverse_depth: f64,
+    ) -> Option<glam::DVec2> {
         let h = self.homogeneous(x, y, inverse_depth);
         (h.z > 1e-9).then(|| h.truncate() / h.z)
     }
