@@ -11,9 +11,11 @@ pub mod scale_space;
 pub mod sfm;
 pub mod triangulate;
 pub mod two_view;
+pub mod uncertainty;
 
 use crate::camera::Intrinsics;
 use crate::frame::{Batch, DepthMap};
+use crate::geometry::uncertainty::Covariance;
 use crate::gpu::GpuError;
 use crate::pose::Rigid;
 
@@ -26,6 +28,32 @@ pub struct Health {
     pub parallax_deg: f64,
     /// Median reprojection error in pixels of the working picture; 0 where unknown.
     pub reprojection_px: f64,
+    /// Of the pose, if the landmarks were exact; `None` where unknown.
+    pub covariance: Option<Covariance>,
+}
+
+impl Health {
+    /// In another unit of length, `factor` of which make one of the old.
+    pub fn rescaled(&self, factor: f64) -> Self {
+        let unit = |axis: usize| if axis < 3 { factor } else { 1.0 };
+        let covariance = self.covariance.map(|old| {
+            std::array::from_fn(|i| std::array::from_fn(|j| old[i][j] * unit(i) * unit(j)))
+        });
+        Self {
+            covariance,
+            ..*self
+        }
+    }
+
+    /// Standard deviations of the pose along and about its least certain axes: (unit of the poses, degrees).
+    pub fn std(&self) -> Option<(f64, f64)> {
+        let covariance = self.covariance?;
+        let worst = |axes: std::ops::Range<usize>| {
+            let variances = axes.map(|i| covariance[i][i]);
+            variances.fold(0.0, f64::max).sqrt()
+        };
+        Some((worst(0..3), worst(3..6).to_degrees()))
+    }
 }
 
 /// One keyframe that the model placed.

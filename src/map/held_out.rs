@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
+use crate::clock::Stamp;
 use crate::frame::RgbImage;
+use crate::geometry::Health;
 use crate::map::SplatMap;
 use crate::map::schedule::Phase;
 use crate::splat::{PoseStep, Rendering, StepSettings};
@@ -40,6 +42,22 @@ impl SplatMap {
         }
         // These steps are no training: their losses must not enter the curve.
         self.engine.take_stats();
+    }
+
+    /// How far the geometry can trust each keyframe's pose; lengths in the map's unit.
+    pub fn health(&mut self) -> Vec<(u32, Stamp, Health)> {
+        let map_poses = self.engine.poses();
+        let scale = self.map_from_model(&map_poses).scale;
+        let placed = self.keyframes.placed.iter();
+        placed
+            .map(|(id, placed)| {
+                (
+                    *id,
+                    placed.keyframe.frame.stamp,
+                    placed.health.rescaled(scale),
+                )
+            })
+            .collect()
     }
 
     /// What the map shows from a keyframe, beside the picture that was taken there.

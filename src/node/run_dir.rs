@@ -16,6 +16,7 @@ use tracing_subscriber::{Layer, fmt as log_format};
 use crate::clock::Stamp;
 use crate::config::Settings;
 use crate::eval::comparisons::Comparison;
+use crate::eval::health::write_health;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
@@ -99,6 +100,7 @@ pub fn finish(
     };
     let report = report(outcome, settings, quality);
     if let Some(out) = out {
+        write_health(&outcome.map.health(), &out.join("keyframes.csv"))?;
         write(outcome, &report, &comparisons, out, input)?;
     }
     Ok(summary(&report, out))

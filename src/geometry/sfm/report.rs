@@ -8,6 +8,7 @@ use super::scene::{NONE, Scene};
 use super::starting::{Start, parallax_deg};
 use crate::camera::Intrinsics;
 use crate::geometry::two_view::median;
+use crate::geometry::uncertainty::pose_covariance;
 use crate::geometry::{Health, Revision};
 use crate::pose::Rigid;
 
@@ -146,7 +147,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
         f64::from(image.height_px) / f64::from(shot.lens.height_px),
     );
     let mut landmarks = Vec::new();
-    let mut errors = Vec::new();
+    let (mut errors, mut sights) = (Vec::new(), Vec::new());
     for (feature, &landmark) in shot
         .landmark_of
         .iter()
@@ -156,6 +157,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
         let at = (shot_ix as u32, feature as u32);
         let point_in_batch = scene.landmarks[landmark as usize].point;
         errors.extend(scene.sight(at).map(|s| s.error_px(point_in_batch)));
+        sights.push((point_in_batch, scene.pixel(at)));
         landmarks.push(Sighting {
             point_in_batch,
             landmark,
@@ -166,6 +168,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
         n_inliers: landmarks.len() as u32,
         parallax_deg: parallax_deg(scene, shot_ix),
         reprojection_px: median(&mut errors).unwrap_or(0.0),
+        covariance: pose_covariance(&placed.cam_from_map, &shot.lens, &sights),
     };
     Some(SparseView {
         keyframe_id: shot.keyframe.id,

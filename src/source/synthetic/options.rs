@@ -162,7 +162,7 @@ const RANGES: [Range; 9] = [
         true,
         "a whole number in [16, 4096]",
     ),
-    Range::new("fov", [20.0, 130.0], false, "degrees in [20, 130]"),
+    Range::new("fov", [20.0, 170.0], false, "degrees in [20, 170]"),
     Range::new("noise", [0.0, 64.0], false, "8-bit levels in [0, 64]"),
     Range::new("exposure", [0.0, 4.0], false, "stops in [0, 4]"),
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
