@@ -1,6 +1,5 @@
 //! How far each keyframe's pose can be trusted, as a table.
 
-use std::fmt::Write;
 use std::path::Path;
 
 use super::{EvalError, write_atomically};
@@ -22,10 +21,8 @@ fn table(rows: &[(u32, Stamp, Health)]) -> String {
         let std = health.std().map_or(",".to_owned(), |(along, about)| {
             format!("{along:.3e},{about:.3e}")
         });
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            text,
-            "{id},{stamp},{},{:.3},{:.3},{std}",
+        text += &format!(
+            "{id},{stamp},{},{:.3},{:.3},{std}\n",
             health.n_inliers, health.parallax_deg, health.reprojection_px
         );
     }

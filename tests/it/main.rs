@@ -45,6 +45,7 @@ mod scene_reference;
 mod scenes;
 mod sfm;
 mod sfm_batches;
+mod sfm_lenses;
 mod shader_layouts;
 mod shaders;
 mod shared_poses;

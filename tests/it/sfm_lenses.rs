@@ -1,0 +1,45 @@
+//! Structure from motion through distorted lenses is as good as through a pinhole.
+
+use std::sync::Arc;
+
+use splat_mapper::clock::Stopwatch;
+use splat_mapper::config::Settings;
+use splat_mapper::frame::Keyframe;
+use splat_mapper::source;
+
+use crate::sfm::{Figures, Shown, run};
+
+/// Every third frame of a walk through the room.
+fn figures(lens: &str) -> Figures {
+    let uri = format!("synthetic:room?frames=36&width=480&height=360&noise=1.5&{lens}");
+    let params = Settings::shipped().params().unwrap();
+    let mut frames = source::open(&uri, &params.source, 1).unwrap();
+    let (mut keyframes, mut truth) = (Vec::new(), Vec::new());
+    while let Some(frame) = frames.next() {
+        if frame.seq % 3 == 0 {
+            truth.push(frame.truth.unwrap());
+            keyframes.push(Arc::new(Keyframe {
+                id: keyframes.len() as u32,
+                frame,
+                age: Stopwatch::start(),
+            }));
+        }
+    }
+    let shown = Shown { keyframes, truth };
+    let figures = run(&shown, &["sfm.max_side=480", "sfm.max_features=1000"]);
+    eprintln!("{lens}: {figures:?}");
+    assert_eq!((figures.registered, figures.components), (12, 1), "{lens}");
+    figures
+}
+
+#[test]
+fn fisheye_and_barrel_cost_at_most_half_of_the_accuracy() {
+    let pinhole = figures("lens=pinhole").ate_percent;
+    for lens in ["lens=radial", "lens=fisheye&fov=150"] {
+        let ate_percent = figures(lens).ate_percent;
+        assert!(
+            ate_percent <= 2.0 * pinhole.max(0.03),
+            "{lens}: {ate_percent} % beside {pinhole} %"
+        );
+    }
+}
