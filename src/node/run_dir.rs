@@ -100,19 +100,19 @@ pub fn finish(
     };
     let report = report(outcome, settings, quality);
     if let Some(out) = out {
-        write_health(&outcome.map.health(), &out.join("keyframes.csv"))?;
         write(outcome, &report, &comparisons, out, input)?;
     }
     Ok(summary(&report, out))
 }
 
 fn write(
-    outcome: &Outcome,
+    outcome: &mut Outcome,
     report: &Report,
     comparisons: &[Comparison],
     out: &Path,
     input: &str,
 ) -> anyhow::Result<()> {
+    let health = outcome.map.health();
     let snapshot = &outcome.snapshot;
     let keyframes = timed_keyframes(snapshot);
     let frames = interpolate(&keyframes, &outcome.frame_stamps);
@@ -139,8 +139,9 @@ fn write(
         seed: report.seed,
         steps: outcome.map.n_steps(),
     };
-    let results: [anyhow::Result<()>; 6] = [
+    let results: [anyhow::Result<()>; 7] = [
         write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
+        write_health(&health, &out.join("keyframes.csv")).map_err(Into::into),
         write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
         ply::write(&snapshot.splats, &out.join("map.ply")).map_err(Into::into),
         checkpoint::write(&checkpoint, &out.join("map.splatmap")).map_err(Into::into),

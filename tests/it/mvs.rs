@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
-use splat_mapper::config::Settings;
 use splat_mapper::frame::{Batch, Keyframe};
 use splat_mapper::geometry::sfm::Sfm;
 use splat_mapper::geometry::{GeometryModel, View};
@@ -15,7 +14,7 @@ use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
 use crate::hard_pictures::{hall, stroll};
 use crate::hard_world::{Flaws, LENS, Paint, depth, film};
 use crate::scenes::scene;
-use crate::sfm::{Shown, keyframe, shown};
+use crate::sfm::{Shown, keyframe, params, shown};
 
 /// What the model has said of each keyframe at the end, and where keyframes saw which landmark.
 struct Told {
@@ -24,11 +23,7 @@ struct Told {
 }
 
 fn told(shown: &Shown, changes: &[&str]) -> Told {
-    let mut settings = Settings::shipped();
-    changes
-        .iter()
-        .for_each(|change| settings.merge_setting(change).unwrap());
-    let params = settings.params().unwrap();
+    let params = params(changes);
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let mut told = Told {
         views: BTreeMap::new(),

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::{DQuat, DVec3};
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::Settings;
+use splat_mapper::config::{Params, Settings};
 use splat_mapper::frame::{Batch, Frame, Keyframe, RgbImage};
 use splat_mapper::geometry::sfm::{NO_PARALLAX, Sfm, SparseBatch};
 use splat_mapper::pose::Rigid;
@@ -157,13 +157,18 @@ pub(crate) struct Figures {
     pub(crate) note: Option<String>,
 }
 
-/// Batches of 8 that share 3, as the node makes them, then the end.
-pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
+/// The shipped parameters with some `key=value` changed.
+pub(crate) fn params(changes: &[&str]) -> Params {
     let mut settings = Settings::shipped();
     changes
         .iter()
         .for_each(|change| settings.merge_setting(change).unwrap());
-    let params = settings.params().unwrap();
+    settings.params().unwrap()
+}
+
+/// Batches of 8 that share 3, as the node makes them, then the end.
+pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
+    let params = params(changes);
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let mut poses = std::collections::BTreeMap::new();
     let mut focal_px = f64::NAN;
