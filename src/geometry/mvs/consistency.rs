@@ -4,6 +4,7 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::RawDepth;
+use super::colours::is_near_rim;
 use crate::camera::Intrinsics;
 use crate::config::MvsParams;
 use crate::frame::DepthMap;
@@ -51,7 +52,7 @@ pub(super) fn verify(
         .zip(map.confidence.par_chunks_mut(width));
     rows.enumerate().for_each(|(y, (depths, confidences))| {
         for x in 0..width {
-            if depths[x] <= 0.0 {
+            if depths[x] <= 0.0 || is_near_rim(&raw.depth, (width, height), x, y) {
                 continue;
             }
             let pixel = glam::DVec2::new(x as f64 + 0.5, y as f64 + 0.5);

@@ -12,7 +12,7 @@ use super::sweep::Warp;
 use super::zncc::{NOISE_VARIANCE, WINDOW};
 
 /// Relative difference of depth that is a jump.
-const JUMP: f32 = 0.04;
+pub(super) const JUMP: f32 = 0.04;
 /// Reach of the matching window: pixels further from a jump are none of its business.
 const REACH: usize = WINDOW / 2;
 const RADIUS: usize = 2;
@@ -42,7 +42,7 @@ pub(super) fn settle(reference: &Prepared, warps: &[Warp<'_>], depth: &mut [f32]
 }
 
 /// The nearest and the farthest depth within reach, where a jump lies between; own depth where it lies on one side only.
-fn across_jump(
+pub(super) fn across_jump(
     depth: &[f32],
     [x, y]: [usize; 2],
     own: f32,

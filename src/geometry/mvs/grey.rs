@@ -1,4 +1,4 @@
-//! A colour picture -> luma at the size of the depth map, by area averaging.
+//! A colour picture -> luma and colours at the size of the depth map, by area averaging.
 
 use crate::config::MvsParams;
 use crate::frame::RgbImage;
@@ -9,6 +9,7 @@ pub(super) struct Grey {
     pub(super) width: usize,
     pub(super) height: usize,
     pub(super) values: Vec<f32>,
+    pub(super) colours: Vec<[u8; 3]>,
 }
 
 /// Cells of the cost volume, 7 bytes each, that one sweep may take: larger settings get a smaller picture.
@@ -30,40 +31,40 @@ impl Grey {
                 width: 0,
                 height: 0,
                 values: Vec::new(),
+                colours: Vec::new(),
             };
         }
         let (width, height) = working_size(from_width, from_height, params);
         let columns = shares(from_width, width);
         let rows = shares(from_height, height);
-        let mut luma = vec![0.0_f32; from_width];
-        let mut values = vec![0.0_f32; width * height];
-        for (y, row) in rows.iter().enumerate() {
-            let into = &mut values[y * width..(y + 1) * width];
+        let mut sums = vec![[0.0_f32; 3]; width];
+        let (mut values, mut colours) = (Vec::new(), Vec::new());
+        values.reserve_exact(width * height);
+        colours.reserve_exact(width * height);
+        for row in &rows {
+            sums.fill([0.0; 3]);
             for (from_y, share_y) in row.cells() {
                 let pixels = &image.pixels[3 * from_y * from_width..3 * (from_y + 1) * from_width];
-                for (value, rgb) in luma.iter_mut().zip(pixels.chunks_exact(3)) {
-                    *value = rgb
-                        .iter()
-                        .zip(LUMA)
-                        .map(|(&c, weight)| f32::from(c) * weight)
-                        .sum();
-                }
-                for (value, column) in into.iter_mut().zip(&columns) {
-                    let sum: f32 = column
-                        .cells()
-                        .map(|(from_x, share_x)| share_x * luma[from_x])
-                        .sum();
-                    *value += share_y * sum;
+                let (pixels, _) = pixels.as_chunks::<3>();
+                for (sum, column) in sums.iter_mut().zip(&columns) {
+                    for (from_x, share_x) in column.cells() {
+                        for (sum, value) in sum.iter_mut().zip(pixels[from_x]) {
+                            *sum += share_y * share_x * f32::from(value);
+                        }
+                    }
                 }
             }
-            for value in into {
-                *value = *value / 255.0 - 0.5;
+            for sum in &sums {
+                let luma: f32 = sum.iter().zip(LUMA).map(|(c, weight)| c * weight).sum();
+                values.push(luma / 255.0 - 0.5);
+                colours.push(sum.map(|c| c.round() as u8));
             }
         }
         Self {
             width,
             height,
             values,
+            colours,
         }
     }
 

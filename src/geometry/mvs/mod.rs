@@ -2,6 +2,7 @@
 //!
 //! Knows nothing of how the poses came about. Lengths are in whatever unit the poses use.
 
+mod colours;
 mod consistency;
 mod edges;
 pub mod gpu;
@@ -162,6 +163,7 @@ impl<'a> Task<'a> {
         let depths = winners.plane.iter().map(|plane| self.planes.depth(*plane));
         let mut depth: Vec<f32> = depths.collect();
         edges::settle(self.reference, &self.warps, &mut depth);
+        colours::settle(self.reference, &mut depth);
         RawDepth {
             intrinsics: self.reference.intrinsics,
             depth,
