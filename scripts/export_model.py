@@ -49,10 +49,14 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--weights", required=True, help="file, folder, hub repository OWNER/NAME, or random")
-    parser.add_argument("--height", type=side, required=True, help="picture height, a multiple of 14; fixed in the file")
+    parser.add_argument(
+        "--height", type=side, required=True, help="picture height, a multiple of 14; fixed in the file"
+    )
     parser.add_argument("--width", type=side, required=True, help="picture width, a multiple of 14; fixed in the file")
     parser.add_argument("--out", type=onnx_path, required=True, help="FILE.onnx; FILE.json is written beside it")
-    parser.add_argument("--precision", choices=("f32", "f16"), default="f32", help="of the body; inputs and outputs are f32")
+    parser.add_argument(
+        "--precision", choices=("f32", "f16"), default="f32", help="of the body; in- and outputs are f32"
+    )
     parser.add_argument("--s-max", type=int, default=16, help="most frames per window that the file may be asked for")
     parser.add_argument("--check-frames", type=counts, default=(1, 2, 4), help="window sizes to compare, as 1,2,4")
     parser.add_argument(
@@ -61,7 +65,7 @@ def arguments() -> argparse.Namespace:
         default="fused",
         help="fused: one ONNX Runtime node, memory linear in frames; plain: standard operators, for TensorRT",
     )
-    parser.add_argument("--external-data", action="store_true", help="weights in FILE.onnx_data even when one file holds them")
+    parser.add_argument("--external-data", action="store_true", help="weights in FILE.onnx_data, however small")
     parser.add_argument("--licence", help="licence of the weights, when it is not the one of the published weights")
     args = parser.parse_args()
     if not 1 <= max(args.check_frames) <= args.s_max:
@@ -117,10 +121,11 @@ def export(args: argparse.Namespace) -> None:
     module = patches.exportable(net, family, args.height, args.width, args.attention == "fused")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=args.out.parent, prefix=".export") as folder, torch.no_grad():
+        heads = nets.heads(net, family)
         (Path(folder) / "raw").mkdir()
-        model = graph.trace(module, images, Path(folder) / "raw")
+        model = graph.trace(module, images, Path(folder) / "raw", args.attention == "fused")
         del module, net
-        write_checked(args, model, images, truth, Path(folder))
+        write_checked(args, model, images, truth, sidecar(args, heads), Path(folder))
     say(f"wrote {args.out} ({time.monotonic() - started:.0f} s in all)")
 
 
@@ -137,7 +142,7 @@ def test_images(frames: int, height: int, width: int):  # noqa: ANN201 (torch is
     return total / 3
 
 
-def write_checked(args, model, images, truth, folder: Path) -> None:  # noqa: ANN001 (torch, onnx are imported late)
+def write_checked(args, model, images, truth, description, folder: Path) -> None:  # noqa: ANN001 (late imports)
     """Saves into `folder`, compares, and moves the files to their place when every output agrees."""
     from model_export import graph, half, nets, parity
 
@@ -154,13 +159,14 @@ def write_checked(args, model, images, truth, folder: Path) -> None:  # noqa: AN
             f"the file does not answer as the network does ({failed[0]}); nothing was written. "
             f"Proven versions: {', '.join(f'{n} {v}' for n, v in PROVEN.items())}"
         )
-    draft.with_suffix(".json").write_text(json.dumps(sidecar(args), indent=1) + "\n")
+    draft.with_suffix(".json").write_text(json.dumps(description, indent=1) + "\n")
     for path in folder.iterdir():
         if path.is_file():
             path.replace(args.out.parent / path.name)
 
 
-def sidecar(args: argparse.Namespace) -> dict[str, object]:
+def sidecar(args: argparse.Namespace, heads: int) -> dict[str, object]:
+    """The description beside the file; `heads` and `attention` let the reader foresee a window's memory."""
     from model_export.nets import FAMILIES
 
     family = FAMILIES[args.network]
@@ -178,6 +184,8 @@ def sidecar(args: argparse.Namespace) -> dict[str, object]:
         "s_min": 1,
         "s_max": args.s_max,
         "precision": args.precision,
+        "heads": heads,
+        "attention": args.attention,
         "licence": args.licence or published,
     }
 

@@ -20,7 +20,7 @@ FRAMES_AT_TRACE = 3
 MAX_ONE_FILE_BYTES = 1_900_000_000
 
 
-def trace(module: nn.Module, images: Tensor, folder: Path) -> onnx.ModelProto:
+def trace(module: nn.Module, images: Tensor, folder: Path, fused: bool) -> onnx.ModelProto:
     """Traces over the first frames with a free number of frames; `folder` takes the exporter's raw files."""
     example = images[:FRAMES_AT_TRACE]
     raw = folder / "traced.onnx"
@@ -40,7 +40,7 @@ def trace(module: nn.Module, images: Tensor, folder: Path) -> onnx.ModelProto:
             input_names=["images"],
             output_names=list(OUTPUTS),
             dynamic_axes={name: {0: "S"} for name in ("images", *OUTPUTS)},
-            custom_opsets={"com.microsoft": 1},
+            custom_opsets={"com.microsoft": 1} if fused else None,
             **options,
         )
     model = onnx.load(str(raw))
@@ -64,7 +64,12 @@ def save(model: onnx.ModelProto, path: Path, external: bool) -> None:
     if external or _weight_bytes(model) > MAX_ONE_FILE_BYTES:
         data = path.name + "_data"
         onnx.save_model(
-            model, str(path), save_as_external_data=True, all_tensors_to_one_file=True, location=data, size_threshold=1024
+            model,
+            str(path),
+            save_as_external_data=True,
+            all_tensors_to_one_file=True,
+            location=data,
+            size_threshold=1024,
         )
     else:
         onnx.save_model(model, str(path))

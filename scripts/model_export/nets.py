@@ -21,13 +21,14 @@ LOUD_LAYER_SCALE = 0.5
 
 # Untrained last layers answer nearly the same everywhere; this brings depth and pose to a spread of some percent.
 LOUD_LAST_LAYER = 10.0
-LAST_LAYERS = ("fc_t.weight", "fc_qvec.weight", "fc_fov.0.weight", "pose_branch.fc2.weight", "output_conv2.2.weight")
+LAST_LAYERS = ("fc_t.weight", "fc_qvec.weight", "output_conv2.2.weight")
 
-# Quaternion near the identity and a field of view near 1 rad: a reader refuses neither. VGGT adds its up four times.
+# A quaternion of length 2, which readers must normalise, and a field of view near 1 rad, which none refuses: near 0
+# its tangent would magnify rounding. VGGT adds its answer up four times.
 PLAUSIBLE_POSE = {
-    "cam_dec.fc_qvec.bias": (0.0, 0.0, 0.0, 1.0),
+    "cam_dec.fc_qvec.bias": (0.0, 0.0, 0.0, 2.0),
     "cam_dec.fc_fov.0.bias": (1.0, 1.0),
-    "camera_head.pose_branch.fc2.bias": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.25, 0.25, 0.25),
+    "camera_head.pose_branch.fc2.bias": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.25, 0.25),
 }
 
 
@@ -60,9 +61,7 @@ FAMILIES: dict[str, Family] = {
     "da3-small": _da3("Apache-2.0", "depth-anything/DA3-SMALL"),
     "da3-base": _da3("Apache-2.0", "depth-anything/DA3-BASE"),
     "da3-large": _da3("CC-BY-NC-4.0", "depth-anything/DA3-LARGE-1.1"),
-    "vggt": Family(
-        "vggt", "vggt", VGGT_INSTALL, "unit", "w2c", "VGGT License v1, non-commercial", "facebook/VGGT-1B"
-    ),
+    "vggt": Family("vggt", "vggt", VGGT_INSTALL, "unit", "w2c", "VGGT License v1, non-commercial", "facebook/VGGT-1B"),
 }
 
 
@@ -171,6 +170,13 @@ def _bare(key: str, wanted: dict[str, Tensor]) -> str:
         if key not in wanted and key.startswith(prefix):
             key = key[len(prefix) :]
     return key
+
+
+def heads(net: nn.Module, family: Family) -> int:
+    """Attention heads of the layers that look at all frames."""
+    if family.family == "da3":
+        return net.backbone.pretrained.num_heads
+    return net.aggregator.global_blocks[0].attn.num_heads
 
 
 @torch.no_grad()
