@@ -49,6 +49,10 @@ class Family:
     repo: str
 
 
+# Parts of the networks that reach the file; the rest may be absent from the weights.
+EXPORTED_PARTS = ("backbone.", "head.", "cam_dec.", "aggregator.", "camera_head.", "depth_head.")
+UNUSED_PARTS = ("_aux.", "mask_token")
+
 DA3_INSTALL = "pip install depth-anything-3==0.1.1 addict omegaconf einops safetensors"
 VGGT_INSTALL = "pip install . in a checkout of facebookresearch/vggt"
 
@@ -73,7 +77,7 @@ def load(name: str, weights: str) -> nn.Module:
     if weights == "random":
         _randomise(net)
     else:
-        _take_weights(net, _state(weights), weights)
+        _take_weights(net, _state(weights, family), weights)
     return net.float().eval()
 
 
@@ -104,12 +108,12 @@ def _randomise(net: nn.Module) -> None:
                 weight.copy_(torch.tensor(PLAUSIBLE_POSE[name]))
 
 
-def _state(weights: str) -> dict[str, Tensor]:
+def _state(weights: str, family: Family) -> dict[str, Tensor]:
     path = Path(weights)
     if path.is_dir():
         path = _only_weights_in(path)
     elif not path.is_file():
-        path = _fetched(weights)
+        path = _fetched(weights, family)
     if path.suffix == ".safetensors":
         try:
             from safetensors.torch import load_file
@@ -130,10 +134,12 @@ def _only_weights_in(folder: Path) -> Path:
     raise Refused(f"no model.safetensors, model.pt or model.pth in {folder}")
 
 
-def _fetched(weights: str) -> Path:
+def _fetched(weights: str, family: Family) -> Path:
     looks_like_path = weights.startswith((".", "/")) or weights.count("/") != 1
     if looks_like_path or weights.endswith((".pt", ".pth", ".safetensors")):
-        raise Refused(f"no weights there; give a file, a folder, a hub repository OWNER/NAME or random: {weights}")
+        raise Refused(
+            f"no weights there; give a file, a folder, random, or a hub repository, as {family.repo}: {weights}"
+        )
     try:
         from huggingface_hub import hf_hub_download
     except ModuleNotFoundError as missing:
@@ -150,10 +156,12 @@ def _fetched(weights: str) -> Path:
 
 
 def _take_weights(net: nn.Module, state: dict[str, Tensor], source: str) -> None:
-    """Loads all weights that the network needs and says which are missing; others must be heads that we drop."""
+    """Loads what the file holds for this network, and refuses when an exported part would stay untrained."""
     wanted = net.state_dict()
     state = {_bare(key, wanted): value for key, value in state.items()}
-    missing = sorted(wanted.keys() - state.keys())
+    # Files leave out all but one name of a tensor that several layers share.
+    held = {wanted[key].data_ptr() for key in wanted.keys() & state.keys()}
+    missing = sorted(k for k in wanted if k not in state and wanted[k].data_ptr() not in held and _is_exported(k))
     unlike = sorted(k for k in wanted.keys() & state.keys() if wanted[k].shape != state[k].shape)
     if missing or unlike:
         faults = [f"{key} is missing" for key in missing]
@@ -162,7 +170,11 @@ def _take_weights(net: nn.Module, state: dict[str, Tensor], source: str) -> None
             f"these are weights of another network: {len(faults)} of {len(wanted)} tensors do not fit, "
             f"first {faults[0]}: {source}"
         )
-    net.load_state_dict({key: state[key] for key in wanted})
+    net.load_state_dict({key: state[key] for key in wanted.keys() & state.keys()}, strict=False)
+
+
+def _is_exported(key: str) -> bool:
+    return key.startswith(EXPORTED_PARTS) and not any(part in key for part in UNUSED_PARTS)
 
 
 def _bare(key: str, wanted: dict[str, Tensor]) -> str:
