@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .nets import PATCH, Family
+from .nets import PATCH, Family, Refused
 
 
 def exportable(net: nn.Module, family: Family, height: int, width: int, fused: bool) -> nn.Module:
@@ -178,7 +178,11 @@ class _OneNode(torch.autograd.Function):
         return node.setType(query.type())
 
 
-def _attention_in_one_node(query: Tensor, key: Tensor, value: Tensor, **_unused: object) -> Tensor:
+def _attention_in_one_node(
+    query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor | None = None, dropout_p: float = 0.0
+) -> Tensor:
+    if attn_mask is not None or dropout_p > 0.0:
+        raise Refused("the network masks or drops attention, which --attention fused cannot say; use plain")
     heads, channels = int(query.shape[1]), int(query.shape[3])
 
     def merge(x: Tensor) -> Tensor:
