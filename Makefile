@@ -1,5 +1,5 @@
 # The four lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint bench ablation soak setup
+.PHONY: demo test lint bench ablation soak onnx-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -35,6 +35,10 @@ soak:
 	cargo build --release --locked --example soak
 	target/release/examples/soak --backend cpu
 	target/release/examples/soak --backend wgpu
+
+# Exports DA3-SMALL with random weights and compares what we read from it with PyTorch. Installs torch (4.5 GB) into target/.
+onnx-test:
+	scripts/onnx_test
 
 setup:
 	scripts/setup all
