@@ -33,7 +33,7 @@ use self::report::{Told, note};
 use self::scene::{NONE, Scene, Shot};
 use self::starting::{Start, start};
 use crate::camera::Intrinsics;
-use crate::config::{MvsParams, SfmParams};
+use crate::config::{MvsParams, OldPoses, SfmParams};
 use crate::frame::{Batch, Keyframe};
 use crate::geometry::features::{Features, Finder, working_picture, working_size};
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
@@ -53,6 +53,7 @@ pub(crate) struct Limits {
     max_error_px: f64,
     min_inliers: usize,
     min_parallax_deg: f64,
+    old_poses: OldPoses,
     seed: u64,
 }
 
@@ -166,6 +167,7 @@ impl Sfm {
             max_error_px: self.sfm.max_error_px * side / ERROR_SIDE_PX,
             min_inliers: self.sfm.min_inliers,
             min_parallax_deg: self.sfm.min_parallax_deg,
+            old_poses: self.sfm.old_poses,
             seed: self.seed,
         }
     }
@@ -185,8 +187,13 @@ impl Sfm {
         let lens = known
             .unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px))
             .resized(w, h);
-        self.scene.shots.push(Shot {
+        let bent_pixels = match known {
+            Some(_) => Vec::new(),
+            None => found.pixels.clone(),
+        };
+        let mut shot = Shot {
             keyframe: Arc::clone(keyframe),
+            bent_pixels,
             signature: signature(&found),
             lens,
             is_calibrated: known.is_some(),
@@ -195,7 +202,9 @@ impl Sfm {
             matched: vec![Vec::new(); found.len()],
             failed_with: 0,
             features: found,
-        });
+        };
+        shot.straighten(self.scene.radial);
+        self.scene.shots.push(shot);
     }
 
     fn guessed_lens(&self, width_px: u32, height_px: u32) -> Intrinsics {
