@@ -11,7 +11,7 @@ use std::ops::Range;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-use self::linear::{Normal, eliminate, follow, linearise, project, strayed, times};
+use self::linear::{Normal, eliminate, follow, linearise};
 use self::reduced::{LENS, Layout};
 use crate::camera::Intrinsics;
 use crate::pose::Rigid;
@@ -73,8 +73,16 @@ pub struct Report {
     pub cost_before: f64,
     pub cost_after: f64,
     pub n_steps: usize,
-    /// Standard deviation of the radial coefficient, where it was refined.
-    pub radial_std: Option<f64>,
+    /// Of the radial coefficient, where it was refined.
+    pub radial: Option<RadialReport>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RadialReport {
+    /// Standard deviation.
+    pub std: f64,
+    /// By what share the weighted squares of the errors would grow without it.
+    pub gain: f64,
 }
 
 /// What moves.
@@ -168,7 +176,7 @@ fn descend(state: &mut State, flat: &Flat<'_>, layout: &Layout, max_steps: usize
         cost_before: cost,
         cost_after: cost,
         n_steps: 0,
-        radial_std: None,
+        radial: None,
     };
     let (mut damping, mut growth) = (1e-4, 2.0);
     let mut system = None;
@@ -203,7 +211,12 @@ fn descend(state: &mut State, flat: &Flat<'_>, layout: &Layout, max_steps: usize
     if flat.moves[1] {
         let normal = system.unwrap_or_else(|| linearise(flat, state, layout));
         let solution = eliminate(&normal, layout, true, 1e-9).solve(flat.moves);
-        report.radial_std = solution.map(|s| (s.lens_variance[1] * normal.variance_px()).sqrt());
+        let lens = state.cameras.iter().find(|c| c.shares_lens);
+        let variance = solution.map(|s| s.lens_variance[1]);
+        report.radial = lens.zip(variance).map(|(lens, variance)| RadialReport {
+            std: (variance * normal.variance_px()).sqrt(),
+            gain: lens.radial * lens.radial / (variance * normal.squares_px()),
+        });
     }
     report
 }
@@ -285,6 +298,36 @@ fn total_cost(state: &State, flat: &Flat<'_>) -> f64 {
                 })
         });
     costs.iter().sum::<f64>() / scale + holds.sum::<f64>()
+}
+
+/// Pixel of a point in the camera, and the plane z = 1 it went through; `None` behind the camera, or where the
+/// radial polynomial has folded.
+fn project(camera: &Camera, point_in_cam: DVec3) -> Option<(DVec2, DVec2, f64)> {
+    if point_in_cam.z <= 1e-9 {
+        return None;
+    }
+    let plane = point_in_cam.truncate() / point_in_cam.z;
+    let bend = camera.radial * plane.length_squared();
+    let i = &camera.intrinsics;
+    let stretch = 1.0 + bend;
+    (3.0 * bend > -1.0).then(|| {
+        let pixel = DVec2::new(
+            i.fx * stretch * plane.x + i.cx,
+            i.fy * stretch * plane.y + i.cy,
+        );
+        (pixel, plane, stretch)
+    })
+}
+
+/// How far a camera has moved from where it is held: shift, then turn.
+fn strayed(camera: &Camera, start: &Camera) -> [f64; 6] {
+    let motion = camera.cam_from_map * start.cam_from_map.inverse();
+    let (shift, turn) = (motion.translation, motion.rotation.to_scaled_axis());
+    [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
+}
+
+fn times(matrix: &[[f64; 6]; 6], v: &[f64; 6]) -> [f64; 6] {
+    std::array::from_fn(|i| (0..6).map(|j| matrix[i][j] * v[j]).sum())
 }
 
 #[cfg(test)]

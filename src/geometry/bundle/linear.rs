@@ -8,7 +8,7 @@ use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::reduced::{HELD, LENS, Layout, Solution, System};
-use super::{Camera, Flat, State};
+use super::{Camera, Flat, State, project, strayed, times};
 
 /// Chunks of points that are summed apart.
 const CHUNKS: usize = 8;
@@ -46,42 +46,17 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// Mean square of the weighted residuals, in one direction.
+    /// Sum of the squares of the weighted residuals.
+    pub(super) fn squares_px(&self) -> f64 {
+        let rows = self.chunks.iter().flat_map(|c| &c.rows);
+        rows.flat_map(|row| row.residual).map(|r| r * r).sum()
+    }
+
+    /// Their mean square.
     pub(super) fn variance_px(&self) -> f64 {
-        let rows = || self.chunks.iter().flat_map(|c| &c.rows);
-        let square = |r: &Row| r.residual[0] * r.residual[0] + r.residual[1] * r.residual[1];
-        rows().map(square).sum::<f64>() / (2 * rows().count().max(1)) as f64
+        let n_rows: usize = self.chunks.iter().map(|c| c.rows.len()).sum();
+        self.squares_px() / (2 * n_rows.max(1)) as f64
     }
-}
-
-/// Pixel of a point in the camera, and the plane z = 1 it went through; `None` behind the camera, or where the
-/// radial polynomial has folded.
-pub(super) fn project(camera: &Camera, point_in_cam: DVec3) -> Option<(DVec2, DVec2, f64)> {
-    if point_in_cam.z <= 1e-9 {
-        return None;
-    }
-    let plane = point_in_cam.truncate() / point_in_cam.z;
-    let bend = camera.radial * plane.length_squared();
-    let i = &camera.intrinsics;
-    let stretch = 1.0 + bend;
-    (3.0 * bend > -1.0).then(|| {
-        let pixel = DVec2::new(
-            i.fx * stretch * plane.x + i.cx,
-            i.fy * stretch * plane.y + i.cy,
-        );
-        (pixel, plane, stretch)
-    })
-}
-
-/// How far a camera has moved from where it is held: shift, then turn.
-pub(super) fn strayed(camera: &Camera, start: &Camera) -> [f64; 6] {
-    let motion = camera.cam_from_map * start.cam_from_map.inverse();
-    let (shift, turn) = (motion.translation, motion.rotation.to_scaled_axis());
-    [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
-}
-
-pub(super) fn times(matrix: &[[f64; 6]; 6], v: &[f64; 6]) -> [f64; 6] {
-    std::array::from_fn(|i| (0..6).map(|j| matrix[i][j] * v[j]).sum())
 }
 
 pub(super) fn linearise(flat: &Flat<'_>, state: &State, layout: &Layout) -> Normal {
@@ -356,17 +331,11 @@ fn times_symmetric(left: &[f64; 18], right: &DMat3) -> [f64; 18] {
 
 fn damped_inverse(v: &[f64; 6], damping: f64) -> Option<DMat3> {
     let own = |value: f64| value + damping * value + 1e-12;
-    let damped = DMat3::from_cols_array(&[
-        own(v[0]),
-        v[1],
-        v[2],
-        v[1],
-        own(v[3]),
-        v[4],
-        v[2],
-        v[4],
-        own(v[5]),
-    ]);
+    let damped = DMat3::from_cols(
+        DVec3::new(own(v[0]), v[1], v[2]),
+        DVec3::new(v[1], own(v[3]), v[4]),
+        DVec3::new(v[2], v[4], own(v[5])),
+    );
     let inverse = damped.inverse();
     inverse.is_finite().then_some(inverse)
 }

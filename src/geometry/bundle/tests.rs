@@ -1,5 +1,6 @@
 //! Made-up cameras and points with known truth.
 
+use glam::DQuat;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
@@ -159,14 +160,21 @@ fn a_barrel_lens_and_its_focal_length_are_found_together() {
         },
     );
     let camera = &found.cameras[0];
-    let std = report.radial_std.unwrap();
+    let std = report.radial.unwrap().std;
     let off = camera.radial + 0.15;
     assert!(std < 0.004 && off.abs() < 4.0 * std, "{off} beside {std}");
     assert!((camera.intrinsics.fx / 500.0 - 1.0).abs() < 5e-3);
     let mut without = disturbed(&truth, 1.08);
     let poor = adjust(&mut without, &settings(100, 5.0, true));
     assert!(poor.cost_after > 5.0 * report.cost_after);
-    assert_eq!((without.cameras[0].radial, poor.radial_std), (0.0, None));
+    assert_eq!((without.cameras[0].radial, poor.radial), (0.0, None));
+    assert!(report.radial.unwrap().gain > 1.0);
+    let mut straight = disturbed(&problem(0.3, 0.0), 1.08);
+    let all = Settings {
+        refine_radial: true,
+        ..settings(100, 5.0, true)
+    };
+    assert!(adjust(&mut straight, &all).radial.unwrap().gain < 0.02);
 }
 
 /// Held by as much as its pixels say, a pose goes about half of the way; held hard it stays, and free it goes all.
@@ -231,4 +239,51 @@ fn nothing_to_move_is_no_fault() {
     held.cameras.iter_mut().for_each(|c| c.is_fixed = true);
     let report = adjust(&mut held, &settings(20, 1.0, false));
     assert!(report.cost_after <= report.cost_before);
+}
+
+/// 500 cameras on a ring that look outwards at a wall, each point seen by about 20: a loop of a robot.
+#[test]
+fn a_long_loop_moves_as_a_whole() {
+    let mut rng = Pcg32::seed_from_u64(4);
+    let intrinsics = problem(0.0, 0.0).cameras[0].intrinsics;
+    let turned = |share: f64| DQuat::from_rotation_y(std::f64::consts::TAU * share);
+    let mut truth = Problem::default();
+    for i in 0..500 {
+        let turn = turned(f64::from(i) / 500.0);
+        truth.cameras.push(Camera {
+            cam_from_map: Rigid::new(turn, turn * (DVec3::Z * 40.0)).inverse(),
+            intrinsics,
+            radial: 0.0,
+            is_fixed: i == 0,
+            hold: None,
+            shares_lens: false,
+        });
+    }
+    for _ in 0..6000 {
+        let out = DVec3::new(
+            0.0,
+            rng.random_range(-2.0..2.0),
+            rng.random_range(45.0..49.0),
+        );
+        let point = turned(rng.random_range(0.0..1.0)) * out;
+        let sight = |(i, camera): (usize, &Camera)| {
+            let pixel = intrinsics.project(camera.cam_from_map.transform_point(point))?;
+            let is_inside = pixel.x > 0.0 && pixel.x < 640.0 && pixel.y > 0.0 && pixel.y < 480.0;
+            is_inside.then_some(Observation {
+                camera_ix: i as u32,
+                pixel,
+            })
+        };
+        let seen: Vec<Observation> = truth.cameras.iter().enumerate().filter_map(sight).collect();
+        truth.add_point(point, seen);
+    }
+    let mut found = disturbed(&truth, 1.0);
+    let begun = crate::clock::Stopwatch::start();
+    let report = adjust(&mut found, &settings(8, 5.0, false));
+    let secs = begun.secs() / report.n_steps as f64;
+    eprintln!(
+        "{} sights, {secs:.3} s a step: {report:?}",
+        truth.observations.len()
+    );
+    assert!(report.cost_after < 1e-3 * report.cost_before, "{report:?}");
 }

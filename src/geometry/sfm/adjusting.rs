@@ -21,10 +21,10 @@ const N_SOFT: usize = 8;
 const LOSS_SHARE: f64 = 0.5;
 /// Views from which on the focal length can be told from depth (GEOMETRY.md measured 3 to be too few, 6 enough).
 const MIN_FOCAL_VIEWS: usize = 6;
-/// A radial coefficient counts from so many standard deviations on, ...
-const SIGNIFICANT: f64 = 6.0;
-/// ... and when it moves a corner of the working picture by so many pixels; else the lens is as good as a pinhole.
-const MIN_BEND_PX: f64 = 0.5;
+/// Share of the squared errors that a radial coefficient must explain: with few views a small one always fits some
+/// error, by far more than its standard deviation. It must also move a corner by more than an inlier may be off: below
+/// that a pinhole loses no matches, and resampling the pictures is not worth it.
+const CLEAR_GAIN: f64 = 0.1;
 
 /// What an adjustment may change.
 struct Moves<'a> {
@@ -143,7 +143,9 @@ fn run(scene: &mut Scene, moves: &Moves<'_>, max_error_px: f64) {
         refine_focal: moves.lens,
         refine_radial: moves.lens,
     };
-    adjust_lens(&mut problem, &settings);
+    // One that is found keeps its lens more easily than it got it: near the limit it would come and go.
+    let share = if scene.radial == 0.0 { 1.0 } else { 0.5 };
+    adjust_lens(&mut problem, &settings, share * max_error_px);
     for (&shot, camera) in shots.iter().zip(&problem.cameras) {
         if let Some(placed) = &mut scene.shots[shot].placed {
             placed.cam_from_map = camera.cam_from_map;
@@ -221,37 +223,24 @@ fn hold(scene: &Scene, shot_ix: usize, landmarks: &[u32], loss_px: f64) -> [[f64
 }
 
 /// Adjusts, and leaves the lens without a radial coefficient unless the pictures clearly ask for one.
-fn adjust_lens(problem: &mut Problem, settings: &Settings) {
-    let shares_lens = problem.cameras.iter().any(|c| c.shares_lens);
-    if !(settings.refine_radial && shares_lens) {
-        let settings = Settings {
-            refine_radial: false,
-            ..*settings
-        };
-        adjust(problem, &settings);
-        return;
-    }
-    let mut plain = problem.clone();
+fn adjust_lens(problem: &mut Problem, settings: &Settings, least_bend_px: f64) {
     let report = adjust(problem, settings);
-    let bent = problem.cameras.iter().filter(|c| c.shares_lens);
-    let bend_px = bent.map(corner_bend_px).fold(0.0, f64::max);
-    let radial = problem.cameras.iter().find(|c| c.shares_lens);
-    let radial = radial.map_or(0.0, |c| c.radial);
-    let is_clear = report
-        .radial_std
-        .is_some_and(|std| radial.abs() > SIGNIFICANT * std);
-    tracing::debug!(radial, std = ?report.radial_std, bend_px, "lens");
-    if is_clear && bend_px >= MIN_BEND_PX {
+    let Some(camera) = problem.cameras.iter().find(|c| c.shares_lens) else {
+        return;
+    };
+    let Some(found) = report.radial else { return };
+    let bend_px = corner_bend_px(camera);
+    tracing::debug!(camera.radial, ?found, bend_px, "lens");
+    if found.gain > CLEAR_GAIN && bend_px >= least_bend_px {
         return;
     }
-    let shared = plain.cameras.iter_mut().filter(|c| c.shares_lens);
+    let shared = problem.cameras.iter_mut().filter(|c| c.shares_lens);
     shared.for_each(|c| c.radial = 0.0);
-    let settings = Settings {
+    let pinhole = Settings {
         refine_radial: false,
         ..*settings
     };
-    adjust(&mut plain, &settings);
-    *problem = plain;
+    adjust(problem, &pinhole);
 }
 
 /// How far the lens moves what a pinhole shows in a corner.

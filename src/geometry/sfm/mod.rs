@@ -14,6 +14,7 @@ pub mod posed;
 mod report;
 mod scene;
 mod starting;
+mod straightening;
 #[cfg(test)]
 mod tests;
 
@@ -26,12 +27,13 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 use self::adjusting::adjust_global;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use self::densify::Densifier;
-use self::links::{link_alike, link_newest, signature};
+use self::links::{link_alike, link_anew, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
 use self::report::{Told, note};
 use self::scene::{NONE, Scene, Shot};
 use self::starting::{Start, start};
+use self::straightening::{links_are_stale, straighten_pictures};
 use crate::camera::Intrinsics;
 use crate::config::{MvsParams, OldPoses, SfmParams};
 use crate::frame::{Batch, Keyframe};
@@ -119,6 +121,13 @@ impl Sfm {
     }
 
     fn tell(&mut self, again: &[usize]) -> SparseBatch {
+        let all: Vec<usize>;
+        let again = if straighten_pictures(&mut self.scene) {
+            all = (0..self.scene.shots.len()).collect();
+            &all
+        } else {
+            again
+        };
         let mut out = self.told.changes(&self.scene, again);
         out.batch_id = self.batch_id;
         out.note = note(&self.scene, self.last_start);
@@ -270,6 +279,13 @@ impl Sfm {
             if outcome != Start::Started {
                 break;
             }
+        }
+        if links_are_stale(&mut self.scene, limits.max_error_px) {
+            link_anew(&mut self.scene, limits.max_error_px, self.seed);
+            for component in 0..self.scene.components.len() as u32 {
+                adjust_global(&mut self.scene, component, limits.max_error_px, 15);
+            }
+            grow(&mut self.scene, pool, limits);
         }
         while merge(&mut self.scene, limits) {
             grow(&mut self.scene, pool, limits);

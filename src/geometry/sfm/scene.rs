@@ -8,6 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
+use super::straightening::Straight;
 use crate::camera::{Distortion, Intrinsics, Lens};
 use crate::frame::{Keyframe, RgbImage};
 use crate::geometry::features::Features;
@@ -95,6 +96,9 @@ pub(super) struct Scene {
     pub(super) components: Vec<Component>,
     /// Of the lens of all uncalibrated shots, as in `bundle::Camera`.
     pub(super) radial: f64,
+    /// The same when the matches were verified.
+    pub(super) linked_with: f64,
+    pub(super) straight: Straight,
 }
 
 impl Scene {
@@ -130,15 +134,19 @@ impl Scene {
         })
     }
 
-    /// Intrinsics at the size of the keyframe's picture.
+    /// Intrinsics at the size of the keyframe's picture; of the straight one, where its lens bends.
     pub(super) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
         let shot = self
             .shots
             .iter()
             .rev()
             .find(|s| s.keyframe.id == keyframe_id)?;
+        if let Some((_, pinhole)) = self.straight.of(shot) {
+            return Some(pinhole);
+        }
         let frame = &shot.keyframe.frame;
-        Some(frame.intrinsics.unwrap_or_else(|| {
+        let known = frame.intrinsics.filter(|_| shot.is_calibrated);
+        Some(known.unwrap_or_else(|| {
             shot.lens
                 .resized(frame.image.width_px, frame.image.height_px)
         }))
