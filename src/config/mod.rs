@@ -125,6 +125,13 @@ pub enum FeatureKind {
     Xfeat,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OldPoses {
+    Held,
+    Soft,
+}
+
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SfmParams {
@@ -136,6 +143,7 @@ pub struct SfmParams {
     pub min_parallax_deg: f64,
     pub max_error_px: f64,
     pub focal_guess: f64,
+    pub old_poses: OldPoses,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]

@@ -11,6 +11,12 @@ use crate::pose::{Rigid, Similarity};
 /// about it. A car that drives straight for 60 m and wanders 30 cm is at 1e-2.
 const LINE_RATIO: f64 = 1e-3;
 
+/// The same, up to which a path may be too near to a line for its own errors: they then turn the roll.
+const NEAR_LINE_RATIO: f64 = 0.05;
+
+/// A turn about the line by which the errors of the positions may have rolled the path, from which on it is told.
+const LOOSE_ROLL_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
+
 /// Spread over distance from the origin below which all positions are one: rounding of the coordinates.
 const POINT_RATIO: f64 = 1e-12;
 
@@ -19,6 +25,19 @@ pub struct Alignment {
     pub reference_from_estimate: Similarity,
     /// The positions lie on a line, so the orientations had to say how the path is rolled about it.
     pub is_line: bool,
+    /// The positions are no line, but so near to one that they hardly say how the path is rolled about it.
+    pub loose_roll: Option<LooseRoll>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct LooseRoll {
+    /// RMS distances to the middle of the path, along the line and across it, in units of the reference.
+    pub along: f64,
+    pub across: f64,
+    /// Turn about the line that errors of the size of those that are left can make up.
+    pub std_rad: f64,
+    /// The alignment with the roll that the orientations ask for.
+    pub by_orientations: Similarity,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -49,29 +68,45 @@ pub fn align(estimate: &[Rigid], reference: &[Rigid]) -> Result<Alignment, Align
     let similarity = umeyama(&source, &target).ok_or(AlignError::Point { of: "run" })?;
 
     let is_line = source_line.ratio.min(target_line.ratio) < LINE_RATIO;
-    if !is_line {
-        return Ok(Alignment {
-            reference_from_estimate: similarity,
-            is_line,
-        });
-    }
-    // The list that is a line names the axis; seen from the reference.
+    // The list that is nearer to a line names the axis; seen from the reference.
     let axis = if target_line.ratio <= source_line.ratio {
         target_line.axis
     } else {
         similarity.rotation * source_line.axis
     };
-    let roll = roll_about(axis, &similarity, estimate, reference);
-    let rotation = (roll * similarity.rotation).normalize();
-    let scale = similarity.scale;
-    let translation = mean(&target) - rotation * mean(&source) * scale;
-    Ok(Alignment {
-        reference_from_estimate: Similarity {
+    let rolled = || {
+        let roll = roll_about(axis, &similarity, estimate, reference);
+        let rotation = (roll * similarity.rotation).normalize();
+        let scale = similarity.scale;
+        Similarity {
             scale,
             rotation,
-            translation,
-        },
+            translation: mean(&target) - rotation * mean(&source) * scale,
+        }
+    };
+    if is_line {
+        return Ok(Alignment {
+            reference_from_estimate: rolled(),
+            is_line,
+            loose_roll: None,
+        });
+    }
+    let across = target_line.ratio * target_line.spread;
+    let errors = source.iter().zip(&target);
+    let square: f64 = errors
+        .map(|(s, t)| similarity.transform_point(*s).distance_squared(*t))
+        .sum();
+    let std_rad = (square / source.len() as f64).sqrt() / across;
+    let is_loose = target_line.ratio < NEAR_LINE_RATIO && std_rad > LOOSE_ROLL_RAD;
+    Ok(Alignment {
+        reference_from_estimate: similarity,
         is_line,
+        loose_roll: is_loose.then(|| LooseRoll {
+            along: target_line.spread,
+            across,
+            std_rad,
+            by_orientations: rolled(),
+        }),
     })
 }
 
@@ -161,6 +196,8 @@ struct Axis {
     axis: DVec3,
     /// Second largest spread over the largest: 0 on a line, 1 in a disc or ball.
     ratio: f64,
+    /// The largest.
+    spread: f64,
 }
 
 /// Direction of the largest spread; `None` when there is none.
@@ -182,6 +219,7 @@ fn principal_axis(points: &[DVec3]) -> Option<Axis> {
     Some(Axis {
         axis: DVec3::new(v[0], v[1], v[2]).normalize(),
         ratio: spread(1) / spread(0),
+        spread: spread(0),
     })
 }
 

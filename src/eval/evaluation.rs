@@ -8,13 +8,13 @@ use glam::DVec3;
 use serde::Serialize;
 
 use super::EvalError;
-use super::align::{AlignError, align};
+use super::align::{AlignError, Alignment, align};
 use super::figures::ordinal;
 use super::report::{Quality, Report};
 use super::trajectory::{
     TOLERANCE_SECS, TimedPose, associate, read_tum, shifted, stamp_offset_nanos,
 };
-use crate::pose::{Rigid, extent};
+use crate::pose::{Rigid, Similarity, extent};
 use crate::source::scene_formats::{Layout, SceneView};
 
 /// What `eval --json` prints. A figure that has no value is null and `note` says why.
@@ -115,10 +115,6 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         .iter()
         .map(|timed| timed.pose.translation)
         .collect();
-    let angles = aligned
-        .iter()
-        .zip(&truth)
-        .map(|(a, t)| a.angle_to(t).to_degrees());
     let motion_errors: Vec<Rigid> = aligned
         .windows(2)
         .zip(truth.windows(2))
@@ -127,15 +123,45 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
     Evaluation {
         ate_rmse: Some(ate),
         ate_percent_of_extent: Some(100.0 * ate / extent(&positions)),
-        rotation_mean_deg: Some(angles.sum::<f64>() / aligned.len() as f64),
-        rpe_translation: Some(rmse(motion_errors.iter().map(|error| error.translation.length()))),
-        rpe_rotation_deg: Some(rmse(motion_errors.iter().map(|error| error.angle_to(&Rigid::IDENTITY).to_degrees()))),
+        rotation_mean_deg: Some(mean_angle_deg(&similarity, &estimated, &truth)),
+        rpe_translation: Some(rmse(
+            motion_errors.iter().map(|error| error.translation.length()),
+        )),
+        rpe_rotation_deg: Some(rmse(
+            motion_errors
+                .iter()
+                .map(|error| error.angle_to(&Rigid::IDENTITY).to_degrees()),
+        )),
         aligned_scale: Some(similarity.scale),
-        note: join_notes(shift_note(offset_nanos), alignment.is_line.then(|| {
-            "the positions lie on a line: the roll about it was aligned by the orientations, so rotation_mean_deg leaves that part out".to_owned()
-        })),
+        note: join_notes(
+            shift_note(offset_nanos),
+            roll_note(&alignment, &estimated, &truth),
+        ),
         ..empty
     }
+}
+
+fn mean_angle_deg(similarity: &Similarity, estimate: &[Rigid], truth: &[Rigid]) -> f64 {
+    let angles = estimate
+        .iter()
+        .zip(truth)
+        .map(|(e, t)| similarity.transform_pose(e).angle_to(t).to_degrees());
+    angles.sum::<f64>() / estimate.len() as f64
+}
+
+/// What a path along a line leaves open.
+fn roll_note(alignment: &Alignment, estimate: &[Rigid], truth: &[Rigid]) -> Option<String> {
+    if alignment.is_line {
+        return Some("the positions lie on a line: the roll about it was aligned by the orientations, so rotation_mean_deg leaves that part out".to_owned());
+    }
+    let loose = alignment.loose_roll.as_ref()?;
+    let without = mean_angle_deg(&loose.by_orientations, estimate, truth);
+    // Beyond a right angle there is no more to say than that nothing is known.
+    let roll = loose.std_rad.to_degrees().min(90.0);
+    Some(format!(
+        "the positions lie nearly on a line (spread {:.3} across, {:.3} along): after alignment by them the roll about it is only known to about {roll:.0} deg, all of which is in rotation_mean_deg; with the roll that the orientations ask for it is {without:.4}",
+        loose.across, loose.along
+    ))
 }
 
 fn shift_note(offset_nanos: i64) -> Option<String> {

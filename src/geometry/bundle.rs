@@ -1,41 +1,62 @@
-//! Poses, points and focal lengths that fit the observations best: bundle adjustment in f64.
+//! Poses, points and one common lens that fit the observations best: bundle adjustment in f64.
 //!
 //! Levenberg-Marquardt with the points eliminated (Schur complement, Triggs et al. 2000) and Cauchy's loss. The
 //! sums run over a fixed number of chunks, so the result does not depend on the number of threads.
 
+mod linear;
+mod reduced;
+
+use std::ops::Range;
+
 use glam::{DMat3, DVec2, DVec3};
-use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
 
+use self::linear::{Normal, eliminate, follow, linearise};
+use self::reduced::{LENS, Layout};
 use crate::camera::Intrinsics;
 use crate::pose::Rigid;
 
-/// Chunks of points that are summed apart.
-const CHUNKS: usize = 4;
-/// Pose, then the logarithm of the focal length.
-const PARAMS: usize = 7;
+/// Largest change of the logarithm of the focal length and of the radial coefficient in one step.
+const MAX_LENS_STEP: [f64; LENS] = [0.3, 0.1];
+/// Points whose costs are summed apart.
+const COST_CHUNK: usize = 1024;
 
 #[derive(Debug, Clone)]
 pub struct Camera {
     pub cam_from_map: Rigid,
     pub intrinsics: Intrinsics,
+    /// The lens shows what a pinhole has at radius r of the plane z = 1 at `r (1 + radial r^2)`: OpenCV's k1.
+    pub radial: f64,
     pub is_fixed: bool,
-    /// This camera's focal length is the one that `Settings::refine_focal` moves.
-    pub shares_focal: bool,
+    /// px^-2, over a shift and a turn in the camera's axes: what else than the observations is known of the pose,
+    /// which speaks for leaving it where it starts.
+    pub hold: Option<[[f64; 6]; 6]>,
+    /// This camera's focal length and radial coefficient are those that `Settings` may move.
+    pub shares_lens: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
 pub struct Observation {
-    pub camera_ix: usize,
+    pub camera_ix: u32,
     pub pixel: DVec2,
 }
 
+/// Points are added with `add_point`, which keeps their observations side by side.
 #[derive(Debug, Clone, Default)]
 pub struct Problem {
     pub cameras: Vec<Camera>,
     pub points: Vec<DVec3>,
-    /// One list a point.
-    pub observations: Vec<Vec<Observation>>,
+    observations: Vec<Observation>,
+    /// By point: where its observations end.
+    ends: Vec<usize>,
+}
+
+impl Problem {
+    pub fn add_point(&mut self, point: DVec3, seen: impl IntoIterator<Item = Observation>) {
+        self.points.push(point);
+        self.observations.extend(seen);
+        self.ends.push(self.observations.len());
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -44,6 +65,7 @@ pub struct Settings {
     /// Residual at which Cauchy's loss starts to bend.
     pub loss_px: f64,
     pub refine_focal: bool,
+    pub refine_radial: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -51,30 +73,124 @@ pub struct Report {
     pub cost_before: f64,
     pub cost_after: f64,
     pub n_steps: usize,
+    /// Of the radial coefficient, where it was refined.
+    pub radial: Option<RadialReport>,
 }
 
-/// Moves the free cameras, all points and, if asked, the one shared focal length.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RadialReport {
+    /// Standard deviation.
+    pub std: f64,
+    /// By what share the weighted squares of the errors would grow without it.
+    pub gain: f64,
+}
+
+/// What moves.
+#[derive(Debug, Clone)]
+struct State {
+    cameras: Vec<Camera>,
+    points: Vec<DVec3>,
+}
+
+/// What stays.
+#[derive(Debug)]
+struct Flat<'a> {
+    observations: &'a [Observation],
+    ends: &'a [usize],
+    start: Vec<Camera>,
+    loss_px: f64,
+    moves: [bool; LENS],
+}
+
+impl Flat<'_> {
+    fn moves_lens(&self) -> bool {
+        self.moves.contains(&true)
+    }
+
+    fn seen(&self, points: Range<usize>) -> &[Observation] {
+        let start = |ix: usize| ix.checked_sub(1).map_or(0, |before| self.ends[before]);
+        &self.observations[start(points.start)..start(points.end)]
+    }
+
+    /// Ranges of points with about equally many observations.
+    fn chunks(&self, n: usize) -> Vec<Range<usize>> {
+        let bound = |i: usize| {
+            let before = self.observations.len() * i / n;
+            if i == n {
+                self.ends.len()
+            } else {
+                self.ends.partition_point(|end| *end < before)
+            }
+        };
+        (0..n).map(|i| bound(i)..bound(i + 1)).collect()
+    }
+}
+
+impl State {
+    fn rotations(&self) -> Vec<DMat3> {
+        let poses = self.cameras.iter().map(|c| &c.cam_from_map);
+        poses.map(Rigid::rotation_matrix).collect()
+    }
+}
+
+/// Moves the free cameras, all points and, if asked, the one shared lens.
 pub fn adjust(problem: &mut Problem, settings: &Settings) -> Report {
-    let layout = Layout::new(problem, settings.refine_focal);
-    let mut cost = total_cost(problem, settings.loss_px);
+    let (flat, mut state) = split(problem, settings);
+    let layout = layout(&flat);
+    let report = descend(&mut state, &flat, &layout, settings.max_steps);
+    problem.cameras = state.cameras;
+    problem.points = state.points;
+    report
+}
+
+/// What stays and what moves, which is taken from the problem.
+fn split<'a>(problem: &'a mut Problem, settings: &Settings) -> (Flat<'a>, State) {
+    let state = State {
+        cameras: std::mem::take(&mut problem.cameras),
+        points: std::mem::take(&mut problem.points),
+    };
+    let is_shared = state.cameras.iter().any(|c| c.shares_lens);
+    let flat = Flat {
+        observations: &problem.observations,
+        ends: &problem.ends,
+        start: state.cameras.clone(),
+        loss_px: settings.loss_px,
+        moves: [settings.refine_focal, settings.refine_radial].map(|asked| asked && is_shared),
+    };
+    (flat, state)
+}
+
+fn layout(flat: &Flat<'_>) -> Layout {
+    let is_held: Vec<bool> = flat.start.iter().map(|c| c.is_fixed).collect();
+    let cameras: Vec<u32> = flat.observations.iter().map(|o| o.camera_ix).collect();
+    let starts = std::iter::once(0).chain(flat.ends.iter().copied());
+    let points = starts
+        .zip(flat.ends)
+        .map(|(start, end)| &cameras[start..*end]);
+    Layout::new(&is_held, points)
+}
+
+fn descend(state: &mut State, flat: &Flat<'_>, layout: &Layout, max_steps: usize) -> Report {
+    let mut cost = total_cost(state, flat);
     let mut report = Report {
         cost_before: cost,
         cost_after: cost,
         n_steps: 0,
+        radial: None,
     };
     let (mut damping, mut growth) = (1e-4, 2.0);
     let mut system = None;
-    for _ in 0..settings.max_steps {
+    for _ in 0..max_steps {
         report.n_steps += 1;
         let normal = system
             .take()
-            .unwrap_or_else(|| linearise(problem, &layout, settings.loss_px));
-        let candidate = step(problem, &layout, &normal, damping);
+            .unwrap_or_else(|| linearise(flat, state, layout));
+        let candidate = step(state, flat, layout, &normal, damping);
         let new_cost = candidate
             .as_ref()
-            .map_or(f64::INFINITY, |c| total_cost(c, settings.loss_px));
+            .map_or(f64::INFINITY, |c| total_cost(c, flat));
         if let Some(candidate) = candidate.filter(|_| new_cost < cost) {
-            *problem = candidate;
+            *state = candidate;
             let gain = (cost - new_cost) / cost.max(1e-300);
             cost = new_cost;
             damping = (damping * 0.2).max(1e-9);
@@ -92,303 +208,126 @@ pub fn adjust(problem: &mut Problem, settings: &Settings) -> Report {
         }
     }
     report.cost_after = cost;
+    if flat.moves[1] {
+        let normal = system.unwrap_or_else(|| linearise(flat, state, layout));
+        let solution = eliminate(&normal, layout, true, 1e-9).solve(flat.moves);
+        let lens = state.cameras.iter().find(|c| c.shares_lens);
+        let variance = solution.map(|s| s.lens_variance[1]);
+        report.radial = lens.zip(variance).map(|(lens, variance)| RadialReport {
+            std: (variance * normal.variance_px()).sqrt(),
+            gain: lens.radial * lens.radial / (variance * normal.squares_px()),
+        });
+    }
     report
 }
 
-/// Where each camera's pose stands in the reduced system; the focal length is last.
-struct Layout {
-    offset: Vec<Option<usize>>,
-    focal: Option<usize>,
-    n: usize,
-}
-
-impl Layout {
-    fn new(problem: &Problem, refine_focal: bool) -> Self {
-        let mut n = 0;
-        let place = |camera: &Camera| {
-            (!camera.is_fixed).then(|| {
-                n += 6;
-                n - 6
-            })
-        };
-        let offset = problem.cameras.iter().map(place).collect();
-        let has_focal = refine_focal && problem.cameras.iter().any(|c| c.shares_focal);
-        Self {
-            offset,
-            focal: has_focal.then_some(n),
-            n: n + usize::from(has_focal),
+/// Solves the damped reduced system and applies the step; `None` where it is not positive definite.
+fn step(
+    state: &State,
+    flat: &Flat<'_>,
+    layout: &Layout,
+    normal: &Normal,
+    damping: f64,
+) -> Option<State> {
+    let system = eliminate(normal, layout, flat.moves_lens(), damping);
+    let mut solution = system.solve(flat.moves)?;
+    for (step, most) in solution.lens.iter_mut().zip(MAX_LENS_STEP) {
+        *step = step.clamp(-most, most);
+    }
+    let mut out = state.clone();
+    for (camera, &slot) in out.cameras.iter_mut().zip(&layout.slot_of) {
+        if let Some([x, y, z, a, b, c]) = solution.poses.get(slot as usize).copied() {
+            let motion = Rigid::exp(DVec3::new(x, y, z), DVec3::new(a, b, c));
+            camera.cam_from_map = (motion * camera.cam_from_map).renormalized();
+        }
+        if camera.shares_lens {
+            camera.intrinsics = camera.intrinsics.refocused(solution.lens[0].exp());
+            camera.radial += solution.lens[1];
         }
     }
-
-    /// Columns of one camera's seven parameters; `None` for those held.
-    fn columns(&self, camera_ix: usize, shares_focal: bool) -> (Option<usize>, Option<usize>) {
-        (self.offset[camera_ix], self.focal.filter(|_| shares_focal))
-    }
+    follow(
+        normal,
+        &solution,
+        (damping, flat.moves_lens()),
+        &mut out.points,
+    );
+    Some(out)
 }
 
-/// One observation, linearised: rows of u and v over pose and focal, and over the point, already weighted.
-struct Row {
-    camera_ix: usize,
-    by_camera: SMatrix<f64, 2, PARAMS>,
-    by_point: SMatrix<f64, 2, 3>,
-    residual: SVector<f64, 2>,
-}
-
-struct PointBlock {
-    rows: Vec<Row>,
-    /// Point-point block and gradient, before damping.
-    v: Matrix3<f64>,
-    g: Vector3<f64>,
-}
-
-struct Normal {
-    blocks: Vec<PointBlock>,
-}
-
-fn linearise(problem: &Problem, _layout: &Layout, loss_px: f64) -> Normal {
-    let rotations: Vec<DMat3> = problem
+/// Cauchy's loss over all observations, and what the holds cost; a point behind a camera costs as much as one
+/// 100 losses away.
+fn total_cost(state: &State, flat: &Flat<'_>) -> f64 {
+    let rotations = state.rotations();
+    let scale = 1.0 / (flat.loss_px * flat.loss_px);
+    let of_point = |point_ix: usize, point: DVec3| -> f64 {
+        // One logarithm of the product, unless it grows too large.
+        let (mut logs, mut product) = (0.0, 1.0);
+        for seen in flat.seen(point_ix..point_ix + 1) {
+            let camera = &state.cameras[seen.camera_ix as usize];
+            let p = rotations[seen.camera_ix as usize] * point + camera.cam_from_map.translation;
+            let share = project(camera, p).map_or(1e4, |(image, ..)| {
+                scale * image.distance_squared(seen.pixel)
+            });
+            product *= 1.0 + share;
+            if product > 1e100 {
+                logs += f64::ln(product);
+                product = 1.0;
+            }
+        }
+        logs + product.ln()
+    };
+    let of_chunk = |(chunk_ix, points): (usize, &[DVec3])| -> f64 {
+        let numbered = points.iter().enumerate();
+        numbered
+            .map(|(i, p)| of_point(chunk_ix * COST_CHUNK + i, *p))
+            .sum()
+    };
+    let chunks = state.points.par_chunks(COST_CHUNK).enumerate();
+    let costs: Vec<f64> = chunks.map(of_chunk).collect();
+    let holds = state
         .cameras
         .iter()
-        .map(|c| c.cam_from_map.rotation_matrix())
-        .collect();
-    let block = |(point, seen): (&DVec3, &Vec<Observation>)| {
-        let rows: Vec<Row> = seen
-            .iter()
-            .filter_map(|o| row(problem, &rotations, *point, o, loss_px))
-            .collect();
-        let mut v = Matrix3::zeros();
-        let mut g = Vector3::zeros();
-        for r in &rows {
-            v += r.by_point.transpose() * r.by_point;
-            g += r.by_point.transpose() * r.residual;
-        }
-        PointBlock { rows, v, g }
-    };
-    Normal {
-        blocks: problem
-            .points
-            .par_iter()
-            .zip(&problem.observations)
-            .map(block)
-            .collect(),
-    }
+        .zip(&flat.start)
+        .map(|(camera, start)| {
+            camera
+                .hold
+                .filter(|_| !camera.is_fixed)
+                .map_or(0.0, |hold| {
+                    let off = strayed(camera, start);
+                    times(&hold, &off).iter().zip(off).map(|(a, b)| a * b).sum()
+                })
+        });
+    costs.iter().sum::<f64>() / scale + holds.sum::<f64>()
 }
 
-fn row(
-    problem: &Problem,
-    rotations: &[DMat3],
-    point: DVec3,
-    seen: &Observation,
-    loss_px: f64,
-) -> Option<Row> {
-    let camera = &problem.cameras[seen.camera_ix];
-    let p = rotations[seen.camera_ix] * point + camera.cam_from_map.translation;
-    let image = camera.intrinsics.project(p)?;
-    let r = image - seen.pixel;
-    // Square root of the weight of iteratively reweighted least squares.
-    let w = (1.0 / (1.0 + r.length_squared() / (loss_px * loss_px))).sqrt();
-    let (x, y, iz) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
-    let (fx, fy) = (w * camera.intrinsics.fx, w * camera.intrinsics.fy);
-    let by_camera = SMatrix::<f64, 2, PARAMS>::from_row_slice(&[
-        fx * iz,
-        0.0,
-        -fx * x * iz,
-        -fx * x * y,
-        fx * (1.0 + x * x),
-        -fx * y,
-        fx * x,
-        0.0,
-        fy * iz,
-        -fy * y * iz,
-        -fy * (1.0 + y * y),
-        fy * x * y,
-        fy * x,
-        fy * y,
-    ]);
-    let turn = rotations[seen.camera_ix].transpose();
-    let (du, dv) = (
-        turn * DVec3::new(fx * iz, 0.0, -fx * x * iz),
-        turn * DVec3::new(0.0, fy * iz, -fy * y * iz),
-    );
-    let by_point = SMatrix::<f64, 2, 3>::new(du.x, du.y, du.z, dv.x, dv.y, dv.z);
-    Some(Row {
-        camera_ix: seen.camera_ix,
-        by_camera,
-        by_point,
-        residual: SVector::<f64, 2>::new(w * r.x, w * r.y),
+/// Pixel of a point in the camera, and the plane z = 1 it went through; `None` behind the camera, or where the
+/// radial polynomial has folded.
+fn project(camera: &Camera, point_in_cam: DVec3) -> Option<(DVec2, DVec2, f64)> {
+    if point_in_cam.z <= 1e-9 {
+        return None;
+    }
+    let plane = point_in_cam.truncate() / point_in_cam.z;
+    let bend = camera.radial * plane.length_squared();
+    let i = &camera.intrinsics;
+    let stretch = 1.0 + bend;
+    (3.0 * bend > -1.0).then(|| {
+        let pixel = DVec2::new(
+            i.fx * stretch * plane.x + i.cx,
+            i.fy * stretch * plane.y + i.cy,
+        );
+        (pixel, plane, stretch)
     })
 }
 
-/// Solves the damped reduced system and applies the step; `None` where it is not positive definite.
-fn step(problem: &Problem, layout: &Layout, normal: &Normal, damping: f64) -> Option<Problem> {
-    let n = layout.n;
-    let chunk_len = normal.blocks.len().div_ceil(CHUNKS).max(1);
-    let parts: Vec<(DMatrix<f64>, DVector<f64>)> = normal
-        .blocks
-        .par_chunks(chunk_len)
-        .map(|blocks| {
-            let mut s = DMatrix::zeros(n, n);
-            let mut b = DVector::zeros(n);
-            for block in blocks {
-                eliminate(problem, layout, block, damping, (&mut s, &mut b));
-            }
-            (s, b)
-        })
-        .collect();
-    let (mut s, mut b) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
-    for (part_s, part_b) in parts {
-        s += part_s;
-        b += part_b;
-    }
-    for i in 0..n {
-        s[(i, i)] += 1e-12;
-    }
-    let delta = if n == 0 { b } else { -s.cholesky()?.solve(&b) };
-    let moved = apply(problem, layout, normal, &delta, damping);
-    delta.iter().all(|v| v.is_finite()).then_some(moved)
+/// How far a camera has moved from where it is held: shift, then turn.
+fn strayed(camera: &Camera, start: &Camera) -> [f64; 6] {
+    let motion = camera.cam_from_map * start.cam_from_map.inverse();
+    let (shift, turn) = (motion.translation, motion.rotation.to_scaled_axis());
+    [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
 }
 
-fn damped(v: &Matrix3<f64>, damping: f64) -> Option<Matrix3<f64>> {
-    let mut v = *v;
-    for i in 0..3 {
-        v[(i, i)] += damping * v[(i, i)] + 1e-12;
-    }
-    v.try_inverse()
-}
-
-/// Adds one point's share to the lower triangle of the reduced system.
-fn eliminate(
-    problem: &Problem,
-    layout: &Layout,
-    block: &PointBlock,
-    damping: f64,
-    (s, b): (&mut DMatrix<f64>, &mut DVector<f64>),
-) {
-    let Some(inverse) = damped(&block.v, damping) else {
-        return;
-    };
-    let cross: Vec<SMatrix<f64, PARAMS, 3>> = block
-        .rows
-        .iter()
-        .map(|r| r.by_camera.transpose() * r.by_point)
-        .collect();
-    let columns: Vec<[Option<usize>; PARAMS]> = block
-        .rows
-        .iter()
-        .map(|r| {
-            let (pose, focal) =
-                layout.columns(r.camera_ix, problem.cameras[r.camera_ix].shares_focal);
-            std::array::from_fn(|i| if i < 6 { pose.map(|p| p + i) } else { focal })
-        })
-        .collect();
-    for (i, row) in block.rows.iter().enumerate() {
-        let mut own = row.by_camera.transpose() * row.by_camera;
-        for k in 0..PARAMS {
-            own[(k, k)] *= 1.0 + damping;
-        }
-        let reduced = cross[i] * inverse;
-        let gradient = row.by_camera.transpose() * row.residual - reduced * block.g;
-        for (a, column) in columns[i].iter().enumerate() {
-            if let Some(column) = column {
-                b[*column] += gradient[a];
-            }
-        }
-        add(s, &columns[i], &columns[i], &own);
-        for (j, other) in cross.iter().enumerate() {
-            if columns[j].iter().all(Option::is_none) {
-                continue;
-            }
-            add(s, &columns[i], &columns[j], &-(reduced * other.transpose()));
-        }
-    }
-}
-
-fn add(
-    s: &mut DMatrix<f64>,
-    rows: &[Option<usize>; PARAMS],
-    columns: &[Option<usize>; PARAMS],
-    values: &SMatrix<f64, PARAMS, PARAMS>,
-) {
-    for (c, column) in columns.iter().enumerate() {
-        let Some(column) = column else { continue };
-        for (r, row) in rows.iter().enumerate() {
-            if let Some(row) = row.filter(|row| row >= column) {
-                s[(row, *column)] += values[(r, c)];
-            }
-        }
-    }
-}
-
-fn apply(
-    problem: &Problem,
-    layout: &Layout,
-    normal: &Normal,
-    delta: &DVector<f64>,
-    damping: f64,
-) -> Problem {
-    let mut out = problem.clone();
-    let focal_step = layout.focal.map_or(0.0, |i| delta[i].clamp(-0.3, 0.3));
-    for (camera, offset) in out.cameras.iter_mut().zip(&layout.offset) {
-        if let Some(at) = *offset {
-            let (rho, theta) = (
-                DVec3::new(delta[at], delta[at + 1], delta[at + 2]),
-                DVec3::new(delta[at + 3], delta[at + 4], delta[at + 5]),
-            );
-            camera.cam_from_map = (Rigid::exp(rho, theta) * camera.cam_from_map).renormalized();
-        }
-        if camera.shares_focal {
-            camera.intrinsics.fx *= focal_step.exp();
-            camera.intrinsics.fy *= focal_step.exp();
-        }
-    }
-    out.points
-        .par_iter_mut()
-        .zip(&normal.blocks)
-        .for_each(|(point, block)| {
-            let Some(inverse) = damped(&block.v, damping) else {
-                return;
-            };
-            let mut right = block.g;
-            for row in &block.rows {
-                let (pose, focal) =
-                    layout.columns(row.camera_ix, problem.cameras[row.camera_ix].shares_focal);
-                let part = SVector::<f64, PARAMS>::from_fn(|i, _| {
-                    let column = if i < 6 { pose.map(|p| p + i) } else { focal };
-                    column.map_or(0.0, |c| delta[c])
-                });
-                right += row.by_point.transpose() * (row.by_camera * part);
-            }
-            let moved = inverse * right;
-            *point -= DVec3::new(moved[0], moved[1], moved[2]);
-        });
-    out
-}
-
-/// Cauchy's loss over all observations; a point behind a camera costs as much as one 100 losses away.
-fn total_cost(problem: &Problem, loss_px: f64) -> f64 {
-    let rotations: Vec<DMat3> = problem
-        .cameras
-        .iter()
-        .map(|c| c.cam_from_map.rotation_matrix())
-        .collect();
-    let cost = |(point, seen): (&DVec3, &Vec<Observation>)| -> f64 {
-        let one = |o: &Observation| {
-            let camera = &problem.cameras[o.camera_ix];
-            let image = camera
-                .intrinsics
-                .project(rotations[o.camera_ix] * *point + camera.cam_from_map.translation);
-            let square = image.map_or(1e4 * loss_px * loss_px, |p| p.distance_squared(o.pixel));
-            loss_px * loss_px * (1.0 + square / (loss_px * loss_px)).ln()
-        };
-        seen.iter().map(one).sum()
-    };
-    let costs: Vec<f64> = problem
-        .points
-        .par_iter()
-        .zip(&problem.observations)
-        .map(cost)
-        .collect();
-    costs.iter().sum()
+fn times(matrix: &[[f64; 6]; 6], v: &[f64; 6]) -> [f64; 6] {
+    std::array::from_fn(|i| (0..6).map(|j| matrix[i][j] * v[j]).sum())
 }
 
 #[cfg(test)]

@@ -72,6 +72,7 @@ impl Known {
                     keyframe_id: keyframe.id,
                     component: 0,
                     intrinsics: keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?,
+                    lens: None,
                     batch_from_cam: truth_of(keyframe)?,
                     depth,
                     health: Health::default(),

@@ -13,7 +13,7 @@ pub mod triangulate;
 pub mod two_view;
 pub mod uncertainty;
 
-use crate::camera::Intrinsics;
+use crate::camera::{Intrinsics, Lens};
 use crate::frame::{Batch, DepthMap};
 use crate::geometry::uncertainty::Covariance;
 use crate::gpu::GpuError;
@@ -63,6 +63,9 @@ pub struct View {
     /// Views with equal numbers share one frame and scale; different numbers have no known relation.
     pub component: u32,
     pub intrinsics: Intrinsics,
+    /// Of the keyframe's picture, where that is no pinhole's: whoever uses the picture first straightens it to
+    /// `intrinsics` (`source::rectify`). May change with a later view of the same keyframe.
+    pub lens: Option<Lens>,
     pub batch_from_cam: Rigid,
     /// In the unit of `batch_from_cam`. May be smaller than the picture; same field of view.
     pub depth: DepthMap,

@@ -54,6 +54,26 @@ pub fn pose_covariance(
         .then_some(covariance)
 }
 
+/// What sights of exact points tell of a pose, in px^-2: the inverse covariance for pixels of standard deviation 1.
+/// Cauchy's loss weighs each by how well it fits.
+pub fn pose_information(
+    cam_from_map: &Rigid,
+    intrinsics: &Intrinsics,
+    sights: impl Iterator<Item = (DVec3, DVec2)>,
+    loss_px: f64,
+) -> [[f64; 6]; 6] {
+    let mut normal = Matrix6::<f64>::zeros();
+    for (point, pixel) in sights {
+        let p = cam_from_map.transform_point(point);
+        if let Some(image) = intrinsics.project(p) {
+            let share = image.distance_squared(pixel) / (loss_px * loss_px);
+            let rows = by_pose(p, intrinsics);
+            normal += rows.transpose() * rows / (1.0 + share);
+        }
+    }
+    std::array::from_fn(|i| std::array::from_fn(|j| normal[(i, j)]))
+}
+
 /// Pixel of a point in the camera, derived by a small shift and turn of the camera in its own axes.
 fn by_pose(p: DVec3, intrinsics: &Intrinsics) -> SMatrix<f64, 2, 6> {
     let (x, y, over) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
@@ -167,6 +187,25 @@ mod tests {
             pose = moved.inverse() * pose;
         }
         pose
+    }
+
+    #[test]
+    fn information_is_the_inverse_of_covariance() {
+        let mut rng = Pcg32::seed_from_u64(3);
+        let points = points(50, &mut rng);
+        let exact: Vec<(DVec3, DVec2)> = points
+            .iter()
+            .map(|p| (*p, LENS.project(*p).unwrap()))
+            .collect();
+        let covariance = pose_covariance(&Rigid::IDENTITY, &LENS, &exact).unwrap();
+        let told = pose_information(&Rigid::IDENTITY, &LENS, exact.into_iter(), 1.0);
+        let product = Matrix6::from_fn(|i, j| covariance[i][j])
+            * Matrix6::from_fn(|i, j| told[i][j])
+            / (MIN_STD_PX * MIN_STD_PX);
+        assert!(
+            (product - Matrix6::identity()).abs().max() < 1e-6,
+            "{product}"
+        );
     }
 
     #[test]

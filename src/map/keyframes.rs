@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use crate::camera::Intrinsics;
+use crate::camera::{Intrinsics, Lens};
 use crate::frame::{DepthMap, Keyframe, RgbImage};
 use crate::geometry::{Health, View};
 use crate::pose::Rigid;
+use crate::source::rectify::Rectifier;
 
 /// A keyframe with a place in the map.
 #[derive(Debug, Clone)]
@@ -19,6 +20,8 @@ pub struct Placed {
     /// The picture that is trained on, and its camera.
     pub image: Arc<RgbImage>,
     pub intrinsics: Intrinsics,
+    /// Of the keyframe's own picture, where that had to be straightened.
+    pub lens: Option<Lens>,
     /// In map units, and its median.
     pub depth: Arc<DepthMap>,
     pub median_depth: Option<f32>,
@@ -76,6 +79,20 @@ impl Keyframes {
             .map(|(_, p)| (map_poses[p.view_ix].inverse(), p.model_from_cam))
             .collect()
     }
+}
+
+/// The keyframe's picture at most `max_side` pixels long, as the view's pinhole sees it, and that pinhole.
+pub fn picture(keyframe: &Keyframe, view: &View, max_side: u32) -> (Arc<RgbImage>, Intrinsics) {
+    let image = keyframe.frame.image.shrunk(max_side);
+    let size = (image.width_px, image.height_px);
+    let pinhole = view.intrinsics.resized(size.0, size.1);
+    let lens = view.lens.map(|lens| lens.resized(size.0, size.1));
+    let rectifier = lens.and_then(|lens| Rectifier::onto(&pinhole, &lens));
+    let straight = match rectifier {
+        Some(rectifier) => rectifier.rectify(image),
+        None => image,
+    };
+    (Arc::new(straight), pinhole)
 }
 
 /// The same depth in another unit.

@@ -295,14 +295,23 @@ impl SplatMap {
             let depth = Arc::new(keyframes::rescaled(&view.depth, factor));
             let median_depth = depth.median();
             if let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) {
-                // A shared keyframe: more neighbours have verified its depth since.
-                self.engine
-                    .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
-                (placed.depth, placed.median_depth) = (depth, median_depth);
+                if placed.lens != view.lens {
+                    let max_side = self.params.max_side;
+                    let (image, pinhole) = keyframes::picture(&placed.keyframe, &view, max_side);
+                    (placed.image, placed.intrinsics) = (Arc::clone(&image), pinhole);
+                    placed.lens = view.lens;
+                    self.engine.set_image(placed.view_ix, image, &pinhole);
+                }
+                // A shared keyframe: more neighbours have verified its depth since, unless it is out of reach.
+                if depth.width_px > 0 {
+                    self.engine
+                        .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
+                    (placed.depth, placed.median_depth) = (depth, median_depth);
+                }
                 placed.health = view.health;
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
-                let image = Arc::new(keyframe.frame.image.shrunk(self.params.max_side));
-                let intrinsics = view.intrinsics.resized(image.width_px, image.height_px);
+                let (image, intrinsics) =
+                    keyframes::picture(&keyframe, &view, self.params.max_side);
                 let cam_from_map = map_from_model
                     .transform_pose(&view.batch_from_cam)
                     .inverse();
@@ -325,6 +334,7 @@ impl SplatMap {
                         model_from_cam: view.batch_from_cam,
                         image,
                         intrinsics,
+                        lens: view.lens,
                         depth,
                         median_depth,
                         depth_factor: 1.0,

@@ -126,6 +126,7 @@ impl SplatMap {
                 keyframe_id: id,
                 component: old_component,
                 intrinsics: placed.intrinsics,
+                lens: placed.lens,
                 batch_from_cam: placed.model_from_cam,
                 depth: (*placed.depth).clone(),
                 health: placed.health,

@@ -36,7 +36,13 @@ impl std::fmt::Debug for Rectifier {
 impl Rectifier {
     /// `None` when the coefficients leave no usable view: such a calibration is wrong.
     pub fn new(lens: &Lens) -> Option<Self> {
-        let pinhole = widest_pinhole(lens)?;
+        Self::onto(&widest_pinhole(lens)?, lens)
+    }
+
+    /// To a pinhole of one's own choice, of which pixels that the lens does not show take the nearest. `None` for
+    /// numbers that are no lens.
+    pub fn onto(pinhole: &Intrinsics, lens: &Lens) -> Option<Self> {
+        let pinhole = *pinhole;
         let (width, height) = (pinhole.width_px as usize, pinhole.height_px as usize);
         let mut xs = Vec::with_capacity(width * height);
         let mut ys = Vec::with_capacity(width * height);

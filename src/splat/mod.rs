@@ -195,6 +195,9 @@ pub trait Engine: Send {
     /// Begins with a fresh network; what the old one did to the poses stays in them.
     fn start_refiner(&mut self, settings: &RefinerSettings);
 
+    /// Replaces a view's picture by one of the same size, and its intrinsics.
+    fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics);
+
     /// Replaces the depth that guides a view's depth loss.
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>);
 

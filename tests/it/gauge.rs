@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use glam::{DQuat, DVec3};
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::config::{MapParams, PoseRefinement, Settings};
-use splat_mapper::frame::{DepthMap, Frame};
+use splat_mapper::frame::{DepthMap, Frame, RgbImage};
 use splat_mapper::geometry::GeometryModel as _;
 use splat_mapper::map::SplatMap;
 use splat_mapper::map::align::Carry;
@@ -81,6 +81,9 @@ impl Engine for Pushed {
     }
     fn set_intrinsics(&mut self, view_ix: usize, intrinsics: &Intrinsics) {
         self.inner.set_intrinsics(view_ix, intrinsics);
+    }
+    fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics) {
+        self.inner.set_image(view_ix, image, intrinsics);
     }
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
         self.inner.set_depth(view_ix, depth);

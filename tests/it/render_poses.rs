@@ -36,6 +36,13 @@ impl Engine for Ramp {
     fn set_pose(&mut self, _: usize, _: Rigid) {}
     fn move_cameras(&mut self, _: &Rigid) {}
     fn set_intrinsics(&mut self, _: usize, _: &Intrinsics) {}
+    fn set_image(
+        &mut self,
+        _: usize,
+        _: std::sync::Arc<splat_mapper::frame::RgbImage>,
+        _: &Intrinsics,
+    ) {
+    }
     fn set_depth(&mut self, _: usize, _: Option<std::sync::Arc<splat_mapper::frame::DepthMap>>) {}
     fn start_refiner(&mut self, _: &RefinerSettings) {}
     fn set_mask(&mut self, _: usize, _: Option<std::sync::Arc<[u8]>>) {}

@@ -10,9 +10,10 @@ use splat_mapper::source;
 use crate::sfm::{Figures, Shown, run};
 
 /// Every third frame of a walk through the room.
-fn figures(lens: &str) -> Figures {
+fn figures(lens: &str, rectify: bool) -> Figures {
     let uri = format!("synthetic:room?frames=36&width=480&height=360&noise=1.5&{lens}");
-    let params = Settings::shipped().params().unwrap();
+    let mut params = Settings::shipped().params().unwrap();
+    params.source.rectify = rectify;
     let mut frames = source::open(&uri, &params.source, 1).unwrap();
     let (mut keyframes, mut truth) = (Vec::new(), Vec::new());
     while let Some(frame) = frames.next() {
@@ -34,12 +35,19 @@ fn figures(lens: &str) -> Figures {
 
 #[test]
 fn fisheye_and_barrel_cost_at_most_half_of_the_accuracy() {
-    let pinhole = figures("lens=pinhole").ate_percent;
+    let pinhole = figures("lens=pinhole", true).ate_percent;
     for lens in ["lens=radial", "lens=fisheye&fov=150"] {
-        let ate_percent = figures(lens).ate_percent;
+        let ate_percent = figures(lens, true).ate_percent;
         assert!(
             ate_percent <= 2.0 * pinhole.max(0.03),
             "{lens}: {ate_percent} % beside {pinhole} %"
         );
     }
+}
+
+/// A barrel lens of which nothing is known: its pictures come as they are.
+#[test]
+fn a_lens_without_calibration_is_straightened_by_what_the_pictures_say() {
+    let figures = figures("lens=radial", false);
+    assert!(figures.ate_percent < 0.5, "{figures:?}");
 }

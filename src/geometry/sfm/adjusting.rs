@@ -2,42 +2,74 @@
 
 use std::collections::BTreeMap;
 
+use glam::DVec2;
+
+use super::Limits;
 use super::landmarks::filter;
-use super::scene::Scene;
+use super::scene::{NONE, Scene};
+use crate::config::OldPoses;
 use crate::geometry::bundle::{Camera, Observation, Problem, Settings, adjust};
 use crate::geometry::two_view::median;
-use crate::pose::Similarity;
+use crate::geometry::uncertainty::pose_information;
+use crate::pose::{Rigid, Similarity};
 
-/// Shots that move in a local adjustment.
+/// Shots that move freely in a local adjustment.
 const N_LOCAL: usize = 7;
-/// Shots that move in a global adjustment; the newest of larger components.
-const MAX_GLOBAL: usize = 150;
+/// Shots next to those that may bend.
+const N_SOFT: usize = 8;
 /// Residual at which the loss bends, as a share of the largest error of an inlier.
 const LOSS_SHARE: f64 = 0.5;
 /// Views from which on the focal length can be told from depth (GEOMETRY.md measured 3 to be too few, 6 enough).
 const MIN_FOCAL_VIEWS: usize = 6;
+/// Share of the squared errors that a radial coefficient must explain: with few views a small one always fits some
+/// error, by far more than its standard deviation. It must also move a corner by more than an inlier may be off: below
+/// that a pinhole loses no matches, and resampling the pictures is not worth it.
+const CLEAR_GAIN: f64 = 0.1;
 
-/// Adjusts a shot and those that share most landmarks with it; all others stay.
-pub(super) fn adjust_local(scene: &mut Scene, shot_ix: usize, max_error_px: f64) {
+/// What an adjustment may change.
+struct Moves<'a> {
+    free: &'a [usize],
+    /// These, too, but their landmarks outside of the adjustment hold them.
+    soft: &'a [usize],
+    lens: bool,
+    max_steps: usize,
+}
+
+/// Adjusts a shot and those that share most landmarks with it. Of the others the nearest may bend, if the
+/// parameters say so; all others stay.
+pub(super) fn adjust_local(scene: &mut Scene, shot_ix: usize, limits: &Limits) {
     let Some(component) = scene.component_of(shot_ix) else {
         return;
     };
     if scene.components[component as usize].shots.len() <= N_LOCAL + 1 {
-        adjust_global(scene, component, max_error_px, 6);
+        adjust_global(scene, component, limits.max_error_px, 6);
         return;
     }
+    // The first shot holds the frame of its component.
+    let first = scene.components[component as usize].shots[0];
     let mut ranked: Vec<(u32, usize)> = scene
         .shared_counts(shot_ix)
         .into_iter()
         .map(|(s, n)| (n, s))
         .collect();
     ranked.sort_by(|a, b| b.0.cmp(&a.0).then(b.1.cmp(&a.1)));
-    let mut free: Vec<usize> = ranked.iter().take(N_LOCAL - 1).map(|r| r.1).collect();
+    let pick = |from: usize, n: usize| {
+        let picked = ranked.iter().skip(from).take(n).map(|r| r.1);
+        picked.filter(|&s| s != first).collect::<Vec<usize>>()
+    };
+    let mut free = pick(0, N_LOCAL - 1);
     free.push(shot_ix);
-    // The first shot holds the frame of its component.
-    let first = scene.components[component as usize].shots[0];
-    free.retain(|&s| s != first);
-    run(scene, &free, max_error_px, (5, false));
+    let soft = match limits.old_poses {
+        OldPoses::Held => Vec::new(),
+        OldPoses::Soft => pick(N_LOCAL - 1, N_SOFT),
+    };
+    let moves = Moves {
+        free: &free,
+        soft: &soft,
+        lens: false,
+        max_steps: 5,
+    };
+    run(scene, &moves, limits.max_error_px);
 }
 
 /// Adjusts all shots of a component but the first, and keeps its scale.
@@ -49,23 +81,16 @@ pub(super) fn adjust_global(
 ) {
     let shots = scene.components[component as usize].shots.clone();
     let Some(&first) = shots.first() else { return };
-    let free: Vec<usize> = shots[1..]
-        .iter()
-        .rev()
-        .take(MAX_GLOBAL)
-        .rev()
-        .copied()
-        .collect();
-    let holds_all = free.len() + 1 == shots.len();
     let before = spread(scene, first, &shots);
-    run(
-        scene,
-        &free,
-        max_error_px,
-        (max_steps, shots.len() >= MIN_FOCAL_VIEWS),
-    );
+    let moves = Moves {
+        free: &shots[1..],
+        soft: &[],
+        lens: shots.len() >= MIN_FOCAL_VIEWS,
+        max_steps,
+    };
+    run(scene, &moves, max_error_px);
     // With one camera held the scale is free; it would drift from one adjustment to the next.
-    if holds_all && let Some(centre) = scene.centre(first) {
+    if let Some(centre) = scene.centre(first) {
         let mut ratios: Vec<f64> = spread(scene, first, &shots)
             .iter()
             .zip(&before)
@@ -108,46 +133,19 @@ pub(super) fn median_error_px(scene: &Scene, shots: &[usize]) -> f64 {
     median(&mut errors).unwrap_or(0.0)
 }
 
-fn run(
-    scene: &mut Scene,
-    free: &[usize],
-    max_error_px: f64,
-    (max_steps, refine_focal): (usize, bool),
-) {
-    let landmarks = scene.landmarks_of(free);
-    let mut problem = Problem::default();
-    let mut camera_of: BTreeMap<u32, usize> = BTreeMap::new();
-    let mut shots = Vec::new();
-    for &landmark in &landmarks {
-        let landmark = &scene.landmarks[landmark as usize];
-        let mut seen = Vec::with_capacity(landmark.seen.len());
-        for &at in &landmark.seen {
-            let shot = &scene.shots[at.0 as usize];
-            let Some(placed) = &shot.placed else { continue };
-            let camera_ix = *camera_of.entry(at.0).or_insert_with(|| {
-                problem.cameras.push(Camera {
-                    cam_from_map: placed.cam_from_map,
-                    intrinsics: shot.lens,
-                    is_fixed: !free.contains(&(at.0 as usize)),
-                    shares_focal: !shot.is_calibrated,
-                });
-                shots.push(at.0 as usize);
-                shots.len() - 1
-            });
-            seen.push(Observation {
-                camera_ix,
-                pixel: scene.pixel(at),
-            });
-        }
-        problem.points.push(landmark.point);
-        problem.observations.push(seen);
-    }
+fn run(scene: &mut Scene, moves: &Moves<'_>, max_error_px: f64) {
+    let landmarks = scene.landmarks_of(moves.free);
+    let loss_px = LOSS_SHARE * max_error_px;
+    let (mut problem, shots) = problem(scene, moves, &landmarks, loss_px);
     let settings = Settings {
-        max_steps,
-        loss_px: LOSS_SHARE * max_error_px,
-        refine_focal,
+        max_steps: moves.max_steps,
+        loss_px,
+        refine_focal: moves.lens,
+        refine_radial: moves.lens,
     };
-    adjust(&mut problem, &settings);
+    // One that is found keeps its lens more easily than it got it: near the limit it would come and go.
+    let share = if scene.radial == 0.0 { 1.0 } else { 0.5 };
+    adjust_lens(&mut problem, &settings, share * max_error_px);
     for (&shot, camera) in shots.iter().zip(&problem.cameras) {
         if let Some(placed) = &mut scene.shots[shot].placed {
             placed.cam_from_map = camera.cam_from_map;
@@ -157,9 +155,10 @@ fn run(
         .cameras
         .iter()
         .zip(&shots)
-        .find(|(c, _)| c.shares_focal);
-    if let Some((camera, &shot)) = moved.filter(|_| refine_focal) {
-        share_focal(scene, camera.intrinsics.fx / scene.shots[shot].lens.fx);
+        .find(|(c, _)| c.shares_lens);
+    if let Some((camera, &shot)) = moved.filter(|_| moves.lens) {
+        let factor = camera.intrinsics.fx / scene.shots[shot].lens.fx;
+        share_lens(scene, factor, camera.radial);
     }
     for (&landmark, point) in landmarks.iter().zip(&problem.points) {
         scene.landmarks[landmark as usize].point = *point;
@@ -167,10 +166,95 @@ fn run(
     filter(scene, &landmarks, max_error_px);
 }
 
-/// One camera took all uncalibrated shots, so all change alike.
-fn share_focal(scene: &mut Scene, factor: f64) {
-    for shot in scene.shots.iter_mut().filter(|s| !s.is_calibrated) {
-        shot.lens.fx *= factor;
-        shot.lens.fy *= factor;
+/// The problem, and the shot of each of its cameras.
+fn problem(
+    scene: &Scene,
+    moves: &Moves<'_>,
+    landmarks: &[u32],
+    loss_px: f64,
+) -> (Problem, Vec<usize>) {
+    let mut problem = Problem::default();
+    let mut camera_of: BTreeMap<u32, u32> = BTreeMap::new();
+    let mut shots = Vec::new();
+    for &landmark in landmarks {
+        let landmark = &scene.landmarks[landmark as usize];
+        let mut seen = Vec::with_capacity(landmark.seen.len());
+        for &at in &landmark.seen {
+            let (shot_ix, shot) = (at.0 as usize, &scene.shots[at.0 as usize]);
+            let Some(placed) = &shot.placed else { continue };
+            let camera_ix = *camera_of.entry(at.0).or_insert_with(|| {
+                let is_soft = moves.soft.contains(&shot_ix);
+                problem.cameras.push(Camera {
+                    cam_from_map: placed.cam_from_map,
+                    intrinsics: shot.lens,
+                    radial: if shot.is_calibrated {
+                        0.0
+                    } else {
+                        scene.radial
+                    },
+                    is_fixed: !is_soft && !moves.free.contains(&shot_ix),
+                    hold: is_soft.then(|| hold(scene, shot_ix, landmarks, loss_px)),
+                    shares_lens: !shot.is_calibrated,
+                });
+                shots.push(shot_ix);
+                shots.len() as u32 - 1
+            });
+            seen.push(Observation {
+                camera_ix,
+                pixel: scene.bent_pixel(at),
+            });
+        }
+        problem.add_point(landmark.point, seen);
     }
+    (problem, shots)
+}
+
+/// What the landmarks that have no part in the adjustment know of a shot's pose, as if they were exact.
+fn hold(scene: &Scene, shot_ix: usize, landmarks: &[u32], loss_px: f64) -> [[f64; 6]; 6] {
+    let shot = &scene.shots[shot_ix];
+    let numbered = shot.landmark_of.iter().enumerate();
+    let others = numbered.filter(|(_, l)| **l != NONE && landmarks.binary_search(l).is_err());
+    let sights = others.map(|(feature, l)| {
+        let at = (shot_ix as u32, feature as u32);
+        (scene.landmarks[*l as usize].point, scene.pixel(at))
+    });
+    let placed = shot.placed.map_or(Rigid::IDENTITY, |p| p.cam_from_map);
+    pose_information(&placed, &shot.lens, sights, loss_px)
+}
+
+/// Adjusts, and leaves the lens without a radial coefficient unless the pictures clearly ask for one.
+fn adjust_lens(problem: &mut Problem, settings: &Settings, least_bend_px: f64) {
+    let report = adjust(problem, settings);
+    let Some(camera) = problem.cameras.iter().find(|c| c.shares_lens) else {
+        return;
+    };
+    let Some(found) = report.radial else { return };
+    let bend_px = corner_bend_px(camera);
+    tracing::debug!(camera.radial, ?found, bend_px, "lens");
+    if found.gain > CLEAR_GAIN && bend_px >= least_bend_px {
+        return;
+    }
+    let shared = problem.cameras.iter_mut().filter(|c| c.shares_lens);
+    shared.for_each(|c| c.radial = 0.0);
+    let pinhole = Settings {
+        refine_radial: false,
+        ..*settings
+    };
+    adjust(problem, &pinhole);
+}
+
+/// How far the lens moves what a pinhole shows in a corner.
+fn corner_bend_px(camera: &Camera) -> f64 {
+    let i = &camera.intrinsics;
+    let corner = i.ray_in_cam(DVec2::ZERO).truncate();
+    camera.radial.abs() * corner.length_squared() * corner.length() * i.fx.max(i.fy)
+}
+
+/// One camera took all uncalibrated shots, so all change alike.
+fn share_lens(scene: &mut Scene, factor: f64, radial: f64) {
+    for shot in scene.shots.iter_mut().filter(|s| !s.is_calibrated) {
+        shot.lens = shot.lens.refocused(factor);
+    }
+    scene.radial = radial;
+    scene.straighten();
 }

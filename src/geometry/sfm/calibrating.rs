@@ -69,12 +69,14 @@ pub(super) fn start_uncalibrated(
 }
 
 fn set_share(scene: &mut Scene, share: f64) {
+    scene.radial = 0.0;
     let is_calibrated: Vec<bool> = scene.shots.iter().map(|s| s.is_calibrated).collect();
     for shot in scene.shots.iter_mut().filter(|s| !s.is_calibrated) {
         let f = share * f64::from(shot.lens.width_px.max(shot.lens.height_px));
         (shot.lens.fx, shot.lens.fy) = (f, f);
         shot.failed_with = 0;
     }
+    scene.straighten();
     for ((a, b), link) in &mut scene.links {
         if !is_calibrated[*a] || !is_calibrated[*b] {
             link.motion = None;

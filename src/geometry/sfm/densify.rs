@@ -1,8 +1,10 @@
 //! Placed keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::report::{SparseBatch, SparseView};
+use crate::camera::Lens;
 use crate::config::MvsParams;
 use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::mvs::MvsView;
@@ -10,6 +12,7 @@ use crate::geometry::mvs::neighbours::depth_range;
 use crate::geometry::mvs::state::MvsState;
 use crate::geometry::{GeometryBatch, PoseError, Sightings, View};
 use crate::gpu::GpuError;
+use crate::source::rectify::Rectifier;
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 96;
@@ -21,6 +24,8 @@ const MAX_DRIFT_PX: f64 = 1.0;
 pub(super) struct Densifier {
     params: MvsParams,
     state: MvsState,
+    /// Of all views so far: the lens by which the picture was straightened.
+    lenses: BTreeMap<u32, Option<Lens>>,
 }
 
 impl Densifier {
@@ -28,6 +33,7 @@ impl Densifier {
         Ok(Self {
             params: params.clone(),
             state: MvsState::new(params.clone(), MAX_HELD)?,
+            lenses: BTreeMap::new(),
         })
     }
 
@@ -70,20 +76,24 @@ impl Densifier {
 
     fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
         let (id, world_from_cam) = (view.keyframe_id, view.batch_from_cam);
-        if self.state.holds(id) {
-            self.state.revise(id, view.intrinsics, world_from_cam);
-        } else if let Some(image) = image_of(id) {
-            self.state.add(
-                id,
-                &MvsView {
+        match self.lenses.get(&id) {
+            // Let go long ago.
+            Some(_) if !self.state.holds(id) => (),
+            Some(lens) if *lens == view.lens => {
+                self.state.revise(id, view.intrinsics, world_from_cam);
+            }
+            _ => {
+                let Some(image) = image_of(id).and_then(|image| straight(image, view)) else {
+                    return;
+                };
+                let picture = MvsView {
                     image,
                     intrinsics: view.intrinsics,
                     world_from_cam,
-                },
-                1.0,
-                2.0,
-                &[],
-            );
+                };
+                self.state.add(id, &picture, 1.0, 2.0, &[]);
+                self.lenses.insert(id, view.lens);
+            }
         }
     }
 
@@ -120,6 +130,7 @@ impl Densifier {
             keyframe_id: view.keyframe_id,
             component: view.component,
             intrinsics: view.intrinsics,
+            lens: view.lens,
             batch_from_cam: view.batch_from_cam,
             depth: self
                 .state
@@ -128,6 +139,15 @@ impl Densifier {
             health: view.health,
         }
     }
+}
+
+/// The picture as the view's pinhole sees it.
+fn straight(image: Arc<RgbImage>, view: &SparseView) -> Option<Arc<RgbImage>> {
+    let Some(lens) = &view.lens else {
+        return Some(image);
+    };
+    let rectifier = Rectifier::onto(&view.intrinsics, lens)?;
+    Some(Arc::new(rectifier.rectify((*image).clone())))
 }
 
 fn sightings(view: &SparseView) -> Sightings {

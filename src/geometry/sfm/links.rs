@@ -3,6 +3,7 @@
 use glam::DVec2;
 use rayon::prelude::*;
 
+use super::landmarks::extend;
 use super::scene::{Link, Scene, Shot};
 use crate::geometry::features::Features;
 use crate::geometry::matching::{Comparable, matches};
@@ -18,6 +19,8 @@ const SIGNATURE: usize = 192;
 const MIN_VOTES: usize = 6;
 /// Older shots asked for likeness; beyond it they are taken evenly.
 const MAX_ASKED: usize = 600;
+/// Shots up to which all are linked anew when the lens turns out to bend.
+const MAX_ANEW: usize = 64;
 /// Verified matches that make a link; fewer are as likely chance.
 const MIN_LINK: usize = 15;
 
@@ -31,13 +34,37 @@ pub(super) fn signature(features: &Features) -> Comparable {
 
 /// Links the newest shot (the last) to earlier ones.
 pub(super) fn link_newest(scene: &mut Scene, max_error_px: f64, seed: u64) {
-    let Some(newest) = scene.shots.len().checked_sub(1) else {
+    if let Some(newest) = scene.shots.len().checked_sub(1) {
+        link_back(scene, newest, max_error_px, seed);
+    }
+}
+
+/// Matches of a bent lens were verified as a pinhole's, which lost those near the rim: all are made again, and the
+/// placed shots take what landmarks they give. Does nothing for a large scene, which has enough.
+pub(super) fn link_anew(scene: &mut Scene, max_error_px: f64, seed: u64) {
+    if scene.shots.len() > MAX_ANEW {
         return;
-    };
-    let recent = newest.saturating_sub(N_RECENT);
-    let mut others = alike(scene, newest, recent);
-    others.extend(recent..newest);
-    link(scene, newest, &others, max_error_px, seed);
+    }
+    scene.links.clear();
+    for shot in &mut scene.shots {
+        shot.matched.iter_mut().for_each(Vec::clear);
+        shot.failed_with = 0;
+    }
+    for shot_ix in 0..scene.shots.len() {
+        link_back(scene, shot_ix, max_error_px, seed);
+    }
+    for component in 0..scene.components.len() {
+        for shot_ix in scene.components[component].shots.clone() {
+            extend(scene, shot_ix, max_error_px);
+        }
+    }
+}
+
+fn link_back(scene: &mut Scene, shot_ix: usize, max_error_px: f64, seed: u64) {
+    let recent = shot_ix.saturating_sub(N_RECENT);
+    let mut others = alike(scene, shot_ix, recent);
+    others.extend(recent..shot_ix);
+    link(scene, shot_ix, &others, max_error_px, seed);
 }
 
 /// Links one shot to those that look alike but were not compared with it, later ones included.

@@ -14,6 +14,7 @@ pub mod posed;
 mod report;
 mod scene;
 mod starting;
+mod straightening;
 #[cfg(test)]
 mod tests;
 
@@ -26,14 +27,15 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 use self::adjusting::adjust_global;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use self::densify::Densifier;
-use self::links::{link_alike, link_newest, signature};
+use self::links::{link_alike, link_anew, link_newest, signature};
 use self::merging::merge;
 use self::placing::grow;
 use self::report::{Told, note};
 use self::scene::{NONE, Scene, Shot};
 use self::starting::{Start, start};
+use self::straightening::{links_are_stale, straighten_pictures};
 use crate::camera::Intrinsics;
-use crate::config::{MvsParams, SfmParams};
+use crate::config::{MvsParams, OldPoses, SfmParams};
 use crate::frame::{Batch, Keyframe};
 use crate::geometry::features::{Features, Finder, working_picture, working_size};
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
@@ -53,6 +55,7 @@ pub(crate) struct Limits {
     max_error_px: f64,
     min_inliers: usize,
     min_parallax_deg: f64,
+    old_poses: OldPoses,
     seed: u64,
 }
 
@@ -118,6 +121,13 @@ impl Sfm {
     }
 
     fn tell(&mut self, again: &[usize]) -> SparseBatch {
+        let all: Vec<usize>;
+        let again = if straighten_pictures(&mut self.scene) {
+            all = (0..self.scene.shots.len()).collect();
+            &all
+        } else {
+            again
+        };
         let mut out = self.told.changes(&self.scene, again);
         out.batch_id = self.batch_id;
         out.note = note(&self.scene, self.last_start);
@@ -166,6 +176,7 @@ impl Sfm {
             max_error_px: self.sfm.max_error_px * side / ERROR_SIDE_PX,
             min_inliers: self.sfm.min_inliers,
             min_parallax_deg: self.sfm.min_parallax_deg,
+            old_poses: self.sfm.old_poses,
             seed: self.seed,
         }
     }
@@ -185,8 +196,13 @@ impl Sfm {
         let lens = known
             .unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px))
             .resized(w, h);
-        self.scene.shots.push(Shot {
+        let bent_pixels = match known {
+            Some(_) => Vec::new(),
+            None => found.pixels.clone(),
+        };
+        let mut shot = Shot {
             keyframe: Arc::clone(keyframe),
+            bent_pixels,
             signature: signature(&found),
             lens,
             is_calibrated: known.is_some(),
@@ -195,7 +211,9 @@ impl Sfm {
             matched: vec![Vec::new(); found.len()],
             failed_with: 0,
             features: found,
-        });
+        };
+        shot.straighten(self.scene.radial);
+        self.scene.shots.push(shot);
     }
 
     fn guessed_lens(&self, width_px: u32, height_px: u32) -> Intrinsics {
@@ -261,6 +279,13 @@ impl Sfm {
             if outcome != Start::Started {
                 break;
             }
+        }
+        if links_are_stale(&mut self.scene, limits.max_error_px) {
+            link_anew(&mut self.scene, limits.max_error_px, self.seed);
+            for component in 0..self.scene.components.len() as u32 {
+                adjust_global(&mut self.scene, component, limits.max_error_px, 15);
+            }
+            grow(&mut self.scene, pool, limits);
         }
         while merge(&mut self.scene, limits) {
             grow(&mut self.scene, pool, limits);

@@ -26,7 +26,7 @@ pub(super) fn grow(scene: &mut Scene, pool: &[usize], limits: &Limits) {
         };
         scene.place(shot, component, cam_from_map);
         extend(scene, shot, limits.max_error_px);
-        adjust_local(scene, shot, limits.max_error_px);
+        adjust_local(scene, shot, limits);
         // Landmarks that the adjustment threw out again spoke for a wrong pose.
         let n_left = scene.shots[shot]
             .landmark_of

@@ -6,7 +6,7 @@ use glam::{DVec2, DVec3};
 
 use super::scene::{NONE, Scene};
 use super::starting::{Start, parallax_deg};
-use crate::camera::Intrinsics;
+use crate::camera::{Intrinsics, Lens};
 use crate::geometry::two_view::median;
 use crate::geometry::uncertainty::pose_covariance;
 use crate::geometry::{Health, Revision};
@@ -23,7 +23,7 @@ pub struct Sighting {
     pub point_in_batch: DVec3,
     /// The same number for the same point in all views.
     pub landmark: u32,
-    /// In the keyframe's picture.
+    /// In the keyframe's picture, straightened where its lens bends.
     pub pixel: DVec2,
 }
 
@@ -43,6 +43,8 @@ pub struct SparseView {
     pub component: u32,
     /// At the size of the keyframe's picture.
     pub intrinsics: Intrinsics,
+    /// As in `View`.
+    pub lens: Option<Lens>,
     pub batch_from_cam: Rigid,
     pub health: Health,
     pub landmarks: Vec<Sighting>,
@@ -84,7 +86,8 @@ impl Told {
             let before = self.cameras.insert(shot_ix, here);
             if before.is_none() || again.contains(&shot_ix) {
                 out.views.extend(view(scene, shot_ix));
-            } else if let Some(before) = before {
+            }
+            if let Some(before) = before {
                 let (old, new) = (before.batch_from_cam, here.batch_from_cam);
                 let moved = before.component != here.component
                     || old.angle_to(&new) > MOVED
@@ -141,11 +144,12 @@ pub(super) fn note(scene: &Scene, start: Option<Start>) -> Option<String> {
 fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     let shot = &scene.shots[shot_ix];
     let placed = shot.placed.as_ref()?;
-    let image = &shot.keyframe.frame.image;
-    let to_picture = DVec2::new(
-        f64::from(image.width_px) / f64::from(shot.lens.width_px),
-        f64::from(image.height_px) / f64::from(shot.lens.height_px),
-    );
+    let intrinsics = scene.intrinsics_of(shot.keyframe.id)?;
+    // Two pinholes of one camera that differ in size, and where the picture was straightened in their view.
+    let to_picture = DVec2::new(intrinsics.fx / shot.lens.fx, intrinsics.fy / shot.lens.fy);
+    let centre = DVec2::new(shot.lens.cx, shot.lens.cy);
+    let in_picture =
+        |pixel: DVec2| (pixel - centre) * to_picture + DVec2::new(intrinsics.cx, intrinsics.cy);
     let mut landmarks = Vec::new();
     let (mut errors, mut sights) = (Vec::new(), Vec::new());
     for (feature, &landmark) in shot
@@ -161,7 +165,7 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
         landmarks.push(Sighting {
             point_in_batch,
             landmark,
-            pixel: scene.pixel(at) * to_picture,
+            pixel: in_picture(scene.pixel(at)),
         });
     }
     let health = Health {
@@ -173,7 +177,8 @@ fn view(scene: &Scene, shot_ix: usize) -> Option<SparseView> {
     Some(SparseView {
         keyframe_id: shot.keyframe.id,
         component: placed.component,
-        intrinsics: scene.intrinsics_of(shot.keyframe.id)?,
+        intrinsics,
+        lens: scene.straight.of(shot).map(|s| s.0),
         batch_from_cam: placed.cam_from_map.inverse(),
         health,
         landmarks,

@@ -6,8 +6,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 
-use crate::camera::Intrinsics;
+use super::straightening::Straight;
+use crate::camera::{Distortion, Intrinsics, Lens};
 use crate::frame::{Keyframe, RgbImage};
 use crate::geometry::features::Features;
 use crate::geometry::matching::Comparable;
@@ -16,7 +18,7 @@ use crate::pose::{Rigid, Similarity};
 
 pub(super) const NONE: u32 = u32::MAX;
 
-/// A keyframe with what was found in it. Pixels and `lens` are of the working picture.
+/// A keyframe with what was found in it. Pixels and `lens` are of the working picture, as a pinhole has them.
 #[derive(Debug)]
 pub(super) struct Shot {
     pub(super) keyframe: Arc<Keyframe>,
@@ -25,6 +27,8 @@ pub(super) struct Shot {
     pub(super) signature: Comparable,
     pub(super) lens: Intrinsics,
     pub(super) is_calibrated: bool,
+    /// Where the features lie in the picture of an uncalibrated camera, whose lens may bend; empty for others.
+    pub(super) bent_pixels: Vec<DVec2>,
     pub(super) placed: Option<Placed>,
     /// Landmark of each feature, or `NONE`.
     pub(super) landmark_of: Vec<u32>,
@@ -32,6 +36,26 @@ pub(super) struct Shot {
     pub(super) matched: Vec<Vec<(u32, u32)>>,
     /// Agreeing landmarks when placing was last tried without success: trying again needs more.
     pub(super) failed_with: usize,
+}
+
+impl Shot {
+    /// Pixels that no ray reaches stay: they fit no landmark.
+    pub(super) fn straighten(&mut self, radial: f64) {
+        let lens = bent(&self.lens, radial);
+        for (pixel, bent) in self.features.pixels.iter_mut().zip(&self.bent_pixels) {
+            let ray = lens.ray_in_cam(*bent).filter(|_| radial != 0.0);
+            let straight = ray.and_then(|ray| self.lens.project(ray));
+            *pixel = straight.unwrap_or(*bent);
+        }
+    }
+}
+
+/// A pinhole with a radial coefficient.
+pub(super) fn bent(pinhole: &Intrinsics, radial: f64) -> Lens {
+    Lens {
+        intrinsics: *pinhole,
+        distortion: Distortion::PlumbBob([radial, 0.0, 0.0, 0.0, 0.0]),
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -70,11 +94,33 @@ pub(super) struct Scene {
     pub(super) links: BTreeMap<(usize, usize), Link>,
     pub(super) landmarks: Vec<Landmark>,
     pub(super) components: Vec<Component>,
+    /// Of the lens of all uncalibrated shots, as in `bundle::Camera`.
+    pub(super) radial: f64,
+    /// The same when the matches were verified.
+    pub(super) linked_with: f64,
+    pub(super) straight: Straight,
 }
 
 impl Scene {
     pub(super) fn pixel(&self, (shot, feature): (u32, u32)) -> DVec2 {
         self.shots[shot as usize].features.pixels[feature as usize]
+    }
+
+    /// Where the picture has it.
+    pub(super) fn bent_pixel(&self, at: (u32, u32)) -> DVec2 {
+        let bent = &self.shots[at.0 as usize].bent_pixels;
+        bent.get(at.1 as usize)
+            .copied()
+            .unwrap_or_else(|| self.pixel(at))
+    }
+
+    /// After a change of `radial` or of the uncalibrated shots' focal length: puts their features where a pinhole
+    /// would have them.
+    pub(super) fn straighten(&mut self) {
+        let radial = self.radial;
+        self.shots
+            .par_iter_mut()
+            .for_each(|shot| shot.straighten(radial));
     }
 
     /// `None` where the shot is not placed.
@@ -88,15 +134,19 @@ impl Scene {
         })
     }
 
-    /// Intrinsics at the size of the keyframe's picture.
+    /// Intrinsics at the size of the keyframe's picture; of the straight one, where its lens bends.
     pub(super) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
         let shot = self
             .shots
             .iter()
             .rev()
             .find(|s| s.keyframe.id == keyframe_id)?;
+        if let Some((_, pinhole)) = self.straight.of(shot) {
+            return Some(pinhole);
+        }
         let frame = &shot.keyframe.frame;
-        Some(frame.intrinsics.unwrap_or_else(|| {
+        let known = frame.intrinsics.filter(|_| shot.is_calibrated);
+        Some(known.unwrap_or_else(|| {
             shot.lens
                 .resized(frame.image.width_px, frame.image.height_px)
         }))

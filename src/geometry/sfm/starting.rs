@@ -133,6 +133,7 @@ fn attempt(
     limits: &Limits,
 ) -> Option<usize> {
     let (pose, _) = scene.links[&(a, b)].motion?;
+    let radial = scene.radial;
     let component = scene.components.len() as u32;
     scene.components.push(Component::default());
     scene.place(a, component, Rigid::IDENTITY);
@@ -166,6 +167,8 @@ fn attempt(
         }
     }
     scene.dissolve(component);
+    scene.radial = radial;
+    scene.straighten();
     None
 }
 

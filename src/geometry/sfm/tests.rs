@@ -4,7 +4,9 @@ use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
+use super::scene::bent;
 use super::*;
+use crate::camera::Distortion;
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::Settings;
 use crate::frame::{Frame, RgbImage};
@@ -28,6 +30,8 @@ struct World {
     points: Vec<DVec3>,
     descriptors: Vec<[u64; 4]>,
     rng: Pcg32,
+    /// Of the lens that sees it.
+    radial: f64,
 }
 
 impl World {
@@ -39,6 +43,7 @@ impl World {
             points,
             descriptors,
             rng,
+            radial: 0.0,
         }
     }
 
@@ -48,8 +53,8 @@ impl World {
         let mut out = Features::default();
         let mut descriptors = Vec::new();
         for i in 0..self.points.len() {
-            let Some(pixel) = camera().project(cam_from_world.transform_point(self.points[i]))
-            else {
+            let lens = bent(&camera(), self.radial);
+            let Some(pixel) = lens.project(cam_from_world.transform_point(self.points[i])) else {
                 continue;
             };
             let inside = pixel.cmpge(DVec2::ZERO).all() && pixel.x < 640.0 && pixel.y < 480.0;
@@ -183,6 +188,43 @@ fn an_unknown_focal_length_is_found_with_the_poses() {
     let focal = out.views[17].intrinsics.fx;
     assert!((focal / 500.0 - 1.0).abs() < 0.01, "{focal} instead of 500");
     assert!(worst(&out, &poses).0 < 0.3);
+}
+
+#[test]
+fn a_lens_that_bends_is_found_with_the_focal_length() {
+    let poses = arc(18, 0.0, 90.0);
+    let mut world = cloud();
+    world.radial = -0.15;
+    let (_, out) = run(&mut world, &poses, None);
+    assert_eq!(out.views.len(), 18);
+    let (turned, off) = worst(&out, &poses);
+    assert!(turned < 0.3 && off < 0.02, "{turned} deg, {off}");
+    for view in &out.views {
+        let lens = view.lens.unwrap();
+        let Distortion::PlumbBob([radial, ..]) = lens.distortion else {
+            panic!("{lens:?}")
+        };
+        assert!((radial / -0.15 - 1.0).abs() < 0.05, "{radial}");
+        assert!((lens.intrinsics.fx / 500.0 - 1.0).abs() < 0.01, "{lens:?}");
+        // Landmarks project to their pixels in the straight picture.
+        let errors = view.landmarks.iter().map(|l| {
+            let in_cam = view
+                .batch_from_cam
+                .inverse()
+                .transform_point(l.point_in_batch);
+            view.intrinsics.project(in_cam).unwrap().distance(l.pixel)
+        });
+        let mut errors: Vec<f64> = errors.collect();
+        let median = crate::geometry::two_view::median(&mut errors).unwrap();
+        assert!(median < 0.6, "{median} px");
+    }
+}
+
+#[test]
+fn a_pinhole_is_not_given_a_lens_that_bends() {
+    let (sfm, out) = run(&mut cloud(), &arc(18, 0.0, 90.0), None);
+    assert!(out.views.iter().all(|v| v.lens.is_none()));
+    assert_eq!(sfm.scene.radial, 0.0);
 }
 
 #[test]

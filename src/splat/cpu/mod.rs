@@ -34,7 +34,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
-use crate::frame::DepthMap;
+use crate::frame::{DepthMap, RgbImage};
 use crate::pose::Rigid;
 use crate::splat::epipolar::{self, Eye};
 use crate::splat::gradients::Gradients;
@@ -238,6 +238,11 @@ impl Engine for CpuEngine {
         let view = self.views[view_ix].training_mut();
         view.intrinsics = *intrinsics;
         view.assert_consistent();
+    }
+
+    fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics) {
+        self.views[view_ix].training_mut().image = image;
+        self.set_intrinsics(view_ix, intrinsics);
     }
 
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {

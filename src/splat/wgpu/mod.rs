@@ -15,7 +15,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
-use crate::frame::DepthMap;
+use crate::frame::{DepthMap, RgbImage};
 use crate::gpu::GpuError;
 use crate::gpu::commands::Commands;
 use crate::gpu::device::{Gpu, Wanted};
@@ -251,6 +251,16 @@ impl Engine for WgpuEngine {
             .confirm()
             .and_then(|()| self.views.start_refiner(&self.gpu, settings));
         self.note(result);
+    }
+
+    fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics) {
+        let result = self.confirm().and_then(|()| {
+            let view = &mut self.views.all[view_ix];
+            view.training.image = image;
+            view.upload(&self.gpu)
+        });
+        self.note(result);
+        self.set_intrinsics(view_ix, intrinsics);
     }
 
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
