@@ -1,0 +1,496 @@
+//! Windows of views, each in its own frame and unit -> one running frame, as long as they overlap and agree.
+//!
+//! A window that does not fit where it overlaps begins a component of its own: it is never welded on. Keeps the last
+//! few views with their depth and nothing else.
+
+use std::collections::VecDeque;
+
+use glam::{DMat3, DQuat, DVec2, DVec3, DVec4};
+use nalgebra::Matrix3;
+
+use super::Refined;
+use crate::config::{AlignParams, JoinBy};
+use crate::frame::DepthMap;
+use crate::geometry::View;
+use crate::pose::{Rigid, Similarity};
+
+/// Pixels of a shared view that its surface is compared by.
+const MAX_SAMPLES: usize = 20_000;
+/// A pixel counts with this share of the lower of both median confidences.
+const MIN_CONFIDENCE: f64 = 0.1;
+/// Huber's loss bends at this share of the median depth, for so many rounds of reweighting.
+const HUBER: f64 = 0.05;
+const ROUNDS: usize = 5;
+/// Distance, as a share of its depth, up to which a point of the window falls on the map's.
+const INLIER: f64 = 0.1;
+/// Points below which two views share no surface.
+const MIN_SAMPLES: usize = 50;
+/// Views kept besides those of `align.history`: what the next window may share.
+const MAX_SHARED: usize = 32;
+
+/// Lays windows one after the other into the frame of the first.
+#[derive(Debug, Clone)]
+pub struct Windows {
+    params: AlignParams,
+    component: u32,
+    n_components: u32,
+    /// Scale of the newest window of the component.
+    last_scale: f64,
+    /// Unit of a component's first window, in that of the running frame.
+    metres_per_unit: f64,
+    /// The newest views of the component, in the running frame, the oldest first.
+    kept: VecDeque<View>,
+}
+
+/// How a window was laid over the views before it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    pub running_from_window: Similarity,
+    /// Share of the shared surface that falls on the map's.
+    pub inliers: f64,
+    /// Largest angle between the headings of a shared keyframe.
+    pub turn_deg: f64,
+    /// Keyframes that it rests on.
+    pub keyframe_ids: Vec<u32>,
+    /// Rotation and place are those of the poses, only the scale was fitted.
+    pub is_scale_only: bool,
+}
+
+/// A window in the running frame of its component.
+#[derive(Debug, Clone, Default)]
+pub struct Joined {
+    /// New ones, and the shared ones again as they were before.
+    pub views: Vec<View>,
+    /// Ids of the shared ones.
+    pub shared: Vec<u32>,
+    /// `None` for the first window of a component.
+    pub fit: Option<Fit>,
+    /// Why a component had to begin, one plain sentence.
+    pub note: Option<String>,
+    /// What the correction of the window in its own frame did.
+    pub refined: Refined,
+}
+
+impl Joined {
+    pub fn is_new(&self, view: &View) -> bool {
+        !self.shared.contains(&view.keyframe_id)
+    }
+}
+
+impl Windows {
+    pub fn new(params: &AlignParams) -> Self {
+        Self {
+            params: params.clone(),
+            component: 0,
+            n_components: 0,
+            last_scale: 1.0,
+            metres_per_unit: 1.0,
+            kept: VecDeque::new(),
+        }
+    }
+
+    /// Metres that one unit of a component's first window stands for, where something outside knows: a network that
+    /// answers in metres, wheels, a second camera. Holds for components that begin afterwards; later windows take
+    /// their scale from the ones before.
+    pub fn set_metres_per_unit(&mut self, metres: f64) {
+        if metres.is_finite() && metres > 0.0 {
+            self.metres_per_unit = metres;
+        }
+    }
+
+    /// A window's views in its own frame -> in the running frame. Views that share a keyframe id with the ones before
+    /// tell how.
+    pub fn join(&mut self, mut window: Vec<View>) -> Joined {
+        let lost = drop_broken(&mut window);
+        if window.is_empty() {
+            return Joined {
+                note: lost,
+                ..Joined::default()
+            };
+        }
+        let mut joined = match self.fit(&window) {
+            Ok(fit) => self.extend(window, fit),
+            Err(reason) => self.begin(window, reason),
+        };
+        joined.note = joined.note.or(lost);
+        joined
+    }
+
+    /// The newest `n` views that were there before a window was joined; none where it began a component.
+    pub fn before(&self, joined: &Joined, n: usize) -> Vec<View> {
+        if joined.fit.is_none() {
+            return Vec::new();
+        }
+        let is_new = |view: &View| {
+            let same = |v: &View| v.keyframe_id == view.keyframe_id;
+            joined.views.iter().any(|v| same(v) && joined.is_new(v))
+        };
+        let old: Vec<View> = self.kept.iter().filter(|v| !is_new(v)).cloned().collect();
+        old[old.len().saturating_sub(n)..].to_vec()
+    }
+
+    /// Takes over better views of keyframes that a window has just brought.
+    pub fn correct(&mut self, views: &[View], joined: &mut Joined) {
+        for better in views {
+            let all = self.kept.iter_mut().chain(&mut joined.views);
+            for view in all.filter(|v| v.keyframe_id == better.keyframe_id) {
+                *view = better.clone();
+            }
+        }
+    }
+
+    fn begin(&mut self, mut window: Vec<View>, reason: Option<String>) -> Joined {
+        self.component = self.n_components;
+        self.n_components += 1;
+        self.last_scale = self.metres_per_unit;
+        self.kept.clear();
+        let unit = Similarity {
+            scale: self.metres_per_unit,
+            ..Similarity::IDENTITY
+        };
+        for view in &mut window {
+            transform(view, &unit, self.component);
+        }
+        self.keep(&window);
+        Joined {
+            views: window,
+            note: reason,
+            ..Joined::default()
+        }
+    }
+
+    fn extend(&mut self, window: Vec<View>, fit: Fit) -> Joined {
+        self.last_scale = fit.running_from_window.scale;
+        let (mut views, mut shared) = (Vec::new(), Vec::new());
+        for mut view in window {
+            if let Some(old) = self.known(view.keyframe_id) {
+                shared.push(view.keyframe_id);
+                views.push(old.clone());
+                continue;
+            }
+            transform(&mut view, &fit.running_from_window, self.component);
+            views.push(view);
+        }
+        let fresh: Vec<View> = views
+            .iter()
+            .filter(|v| !shared.contains(&v.keyframe_id))
+            .cloned()
+            .collect();
+        self.keep(&fresh);
+        Joined {
+            views,
+            shared,
+            fit: Some(fit),
+            ..Joined::default()
+        }
+    }
+
+    fn keep(&mut self, views: &[View]) {
+        self.kept.extend(views.iter().cloned());
+        while self.kept.len() > self.params.history + MAX_SHARED {
+            self.kept.pop_front();
+        }
+    }
+
+    fn known(&self, keyframe_id: u32) -> Option<&View> {
+        self.kept
+            .iter()
+            .rev()
+            .find(|v| v.keyframe_id == keyframe_id)
+    }
+
+    /// The first way of joining that passes all gates; an error says why there is none, and holds nothing for the
+    /// very first window.
+    fn fit(&self, window: &[View]) -> Result<Fit, Option<String>> {
+        if self.kept.is_empty() {
+            return Err(None);
+        }
+        let shared: Vec<Shared<'_>> = window
+            .iter()
+            .filter_map(|new| Some(Shared::new(self.known(new.keyframe_id)?, new)))
+            .collect();
+        if shared.is_empty() {
+            let sentence =
+                "a window shares no keyframe with the ones before, so it is a component of its own";
+            return Err(Some(sentence.to_owned()));
+        }
+        let mut faults = Vec::new();
+        let whole = &shared[..];
+        let mut ways: Vec<(&[Shared<'_>], bool)> = vec![(whole, true)];
+        if self.params.join == JoinBy::Points && shared.len() > 1 {
+            ways.insert(0, (whole, false));
+        }
+        if shared.len() > 1 {
+            // A window may have lost one shared keyframe and not the other.
+            ways.extend(shared.chunks(1).map(|one| (one, true)));
+        }
+        for (shared, is_scale_only) in ways {
+            match self.gated(shared, is_scale_only) {
+                Ok(fit) => return Ok(fit),
+                Err(fault) => faults.push(fault),
+            }
+        }
+        let first = faults.into_iter().next().unwrap_or_default();
+        Err(Some(format!(
+            "a window does not fit the ones before ({first}), so it is a component of its own"
+        )))
+    }
+
+    fn gated(&self, shared: &[Shared<'_>], is_scale_only: bool) -> Result<Fit, String> {
+        let found = if is_scale_only {
+            by_poses(shared)
+        } else {
+            by_points(shared)
+        };
+        let Some(similarity) = found else {
+            return Err("its shared keyframes have no depth in common".to_owned());
+        };
+        let turn_deg = shared
+            .iter()
+            .map(|s| {
+                let laid = similarity.transform_pose(&s.new.batch_from_cam);
+                laid.angle_to(&s.old.batch_from_cam).to_degrees()
+            })
+            .fold(0.0, f64::max);
+        let inliers = inlier_share(shared, &similarity);
+        let (jump, params) = (similarity.scale / self.last_scale, &self.params);
+        let is_near =
+            |ratio: f64| ratio <= params.max_scale_jump && ratio >= 1.0 / params.max_scale_jump;
+        if !is_near(jump) {
+            return Err(format!(
+                "its scale is {jump:.2} times that of the window before"
+            ));
+        }
+        if turn_deg.is_nan() || turn_deg > params.max_turn_deg {
+            return Err(format!("a shared keyframe is turned by {turn_deg:.1} deg"));
+        }
+        if inliers.is_nan() || inliers < params.min_inliers {
+            let percent = 100.0 * inliers;
+            return Err(format!("{percent:.0} % of the shared surface agree"));
+        }
+        Ok(Fit {
+            running_from_window: similarity,
+            inliers,
+            turn_deg,
+            keyframe_ids: shared.iter().map(|s| s.new.keyframe_id).collect(),
+            is_scale_only,
+        })
+    }
+}
+
+/// Removes views that are no views; the map must never see NaN. Returns a sentence if any went.
+pub fn drop_broken(window: &mut Vec<View>) -> Option<String> {
+    let before = window.len();
+    window.retain(|view| {
+        let is_unit = (view.batch_from_cam.rotation.length_squared() - 1.0).abs() < 1e-3;
+        let d = &view.depth;
+        let n = d.width_px as usize * d.height_px as usize;
+        let is_whole = d.depth.len() == n && d.confidence.len() == n;
+        view.batch_from_cam.is_finite() && is_unit && view.intrinsics.is_plausible() && is_whole
+    });
+    let n = before - window.len();
+    (n > 0).then(|| format!("{n} of {before} views of a window have no usable camera"))
+}
+
+/// The view in another frame and unit.
+fn transform(view: &mut View, target_from_batch: &Similarity, component: u32) {
+    view.component = component;
+    view.batch_from_cam = target_from_batch
+        .transform_pose(&view.batch_from_cam)
+        .renormalized();
+    view.health = view.health.rescaled(target_from_batch.scale);
+    let values = view.depth.depth.iter_mut();
+    values.for_each(|d| *d = (f64::from(*d) * target_from_batch.scale) as f32);
+}
+
+/// A keyframe before, and as the window has it.
+struct Shared<'a> {
+    old: &'a View,
+    new: &'a View,
+    /// Points in the frames of both that the same pixel shows.
+    samples: Vec<Sample>,
+    median_depth: f64,
+}
+
+struct Sample {
+    old: DVec3,
+    new: DVec3,
+    old_depth: f64,
+    log_ratio: f64,
+    weight: f64,
+}
+
+impl<'a> Shared<'a> {
+    fn new(old: &'a View, new: &'a View) -> Self {
+        let (w, h) = (old.depth.width_px as usize, old.depth.height_px as usize);
+        let (new_w, new_h) = (new.depth.width_px as usize, new.depth.height_px as usize);
+        let min = MIN_CONFIDENCE * median_confidence(&old.depth).min(median_confidence(&new.depth));
+        let old_lens = old
+            .intrinsics
+            .resized(old.depth.width_px, old.depth.height_px);
+        let new_lens = new
+            .intrinsics
+            .resized(new.depth.width_px, new.depth.height_px);
+        let n = (w * h).min(MAX_SAMPLES);
+        let centre = |x: usize, y: usize| DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+        let sample = |k: usize| {
+            let at = k * w * h / n;
+            let (x, y) = (at % w, at / w);
+            let (new_x, new_y) = (x * new_w / w, y * new_h / h);
+            let (old_depth, old_confidence) = old.depth.verified(at)?;
+            let (new_depth, new_confidence) = new.depth.verified(new_y * new_w + new_x)?;
+            let (old_depth, new_depth) = (f64::from(old_depth), f64::from(new_depth));
+            let lowest = f64::from(old_confidence.min(new_confidence));
+            let old_in_cam = old_lens.ray_in_cam(centre(x, y)) * old_depth;
+            let new_in_cam = new_lens.ray_in_cam(centre(new_x, new_y)) * new_depth;
+            (lowest > min).then(|| Sample {
+                old: old.batch_from_cam.transform_point(old_in_cam),
+                new: new.batch_from_cam.transform_point(new_in_cam),
+                old_depth,
+                log_ratio: (old_depth / new_depth).ln(),
+                weight: f64::from(old_confidence * new_confidence).sqrt(),
+            })
+        };
+        Self {
+            old,
+            new,
+            samples: (0..n).filter_map(sample).collect(),
+            median_depth: old.depth.median().map_or(0.0, f64::from),
+        }
+    }
+}
+
+fn median_confidence(depth: &DepthMap) -> f64 {
+    let mut values: Vec<f32> = (0..depth.depth.len())
+        .filter_map(|at| Some(depth.verified(at)?.1))
+        .collect();
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+fn all_samples<'a>(shared: &'a [Shared<'_>]) -> impl Iterator<Item = &'a Sample> {
+    shared.iter().flat_map(|s| &s.samples)
+}
+
+fn inlier_share(shared: &[Shared<'_>], similarity: &Similarity) -> f64 {
+    let (mut n, mut all) = (0.0, 0.0);
+    for sample in all_samples(shared) {
+        all += 1.0;
+        let off = similarity.transform_point(sample.new) - sample.old;
+        if off.length() < INLIER * sample.old_depth {
+            n += 1.0;
+        }
+    }
+    n / all
+}
+
+/// Scale by the ratio of the depths of the same pixels, the rest by the poses.
+fn by_poses(shared: &[Shared<'_>]) -> Option<Similarity> {
+    let mut ratios: Vec<(f64, f64)> = all_samples(shared)
+        .map(|s| (s.log_ratio, s.weight))
+        .collect();
+    if ratios.len() < MIN_SAMPLES {
+        return None;
+    }
+    ratios.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = 0.5 * ratios.iter().map(|r| r.1).sum::<f64>();
+    let mut sum = 0.0;
+    let middle = ratios.iter().find(|r| {
+        sum += r.1;
+        sum >= half
+    })?;
+    let scale = middle.0.exp();
+    let turns = shared
+        .iter()
+        .map(|s| s.old.batch_from_cam.rotation * s.new.batch_from_cam.rotation.conjugate());
+    let rotation = mean_rotation(turns)?;
+    let places = shared.iter().map(|s| {
+        s.old.batch_from_cam.translation - rotation * s.new.batch_from_cam.translation * scale
+    });
+    Some(Similarity {
+        scale,
+        rotation,
+        translation: places.sum::<DVec3>() / shared.len() as f64,
+    })
+}
+
+/// Of rotations close together: the sum of the quaternions of one hemisphere.
+fn mean_rotation(rotations: impl Iterator<Item = DQuat>) -> Option<DQuat> {
+    let mut sum = DVec4::ZERO;
+    for rotation in rotations {
+        let q = DVec4::from(rotation);
+        sum += if sum.dot(q) < 0.0 { -q } else { q };
+    }
+    (sum.length() > 1e-6).then(|| DQuat::from_vec4(sum).normalize())
+}
+
+/// Weighted similarity between the surfaces, reweighted by Huber's loss.
+fn by_points(shared: &[Shared<'_>]) -> Option<Similarity> {
+    let samples: Vec<&Sample> = all_samples(shared).collect();
+    if samples.len() < MIN_SAMPLES {
+        return None;
+    }
+    let medians = shared.iter().map(|s| s.median_depth).sum::<f64>();
+    let bend = HUBER * medians / shared.len() as f64;
+    let mut weights: Vec<f64> = samples.iter().map(|s| s.weight).collect();
+    let mut found = None;
+    for _ in 0..ROUNDS {
+        let similarity = weighted_similarity(&samples, &weights)?;
+        for (weight, s) in weights.iter_mut().zip(&samples) {
+            let off = (similarity.transform_point(s.new) - s.old).length();
+            *weight = s.weight * if off > bend { bend / off } else { 1.0 };
+        }
+        found = Some(similarity);
+    }
+    found
+}
+
+/// Least squares in closed form (Umeyama 1991), weighted.
+fn weighted_similarity(samples: &[&Sample], weights: &[f64]) -> Option<Similarity> {
+    let total: f64 = weights.iter().sum();
+    let mean = |of: &dyn Fn(&Sample) -> DVec3| {
+        let parts = samples.iter().zip(weights).map(|(s, w)| of(s) * *w);
+        parts.sum::<DVec3>() / total
+    };
+    let (old_mean, new_mean) = (mean(&|s| s.old), mean(&|s| s.new));
+    let (mut covariance, mut spread) = (DMat3::ZERO, 0.0);
+    for (s, w) in samples.iter().zip(weights) {
+        let (a, b) = (s.old - old_mean, s.new - new_mean);
+        covariance += DMat3::from_cols(a * b.x, a * b.y, a * b.z) * *w;
+        spread += w * b.length_squared();
+    }
+    let svd =
+        Matrix3::from_column_slice(&covariance.to_cols_array()).try_svd(true, true, 1e-12, 200)?;
+    let (u, v_t) = (svd.u?, svd.v_t?);
+    let mirror = if (u * v_t).determinant() < 0.0 {
+        -1.0
+    } else {
+        1.0
+    };
+    let signs = Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, 1.0, mirror));
+    let turn: [[f64; 3]; 3] = (u * signs * v_t).into();
+    let rotation = DQuat::from_mat3(&DMat3::from_cols_array_2d(&turn)).normalize();
+    let d = svd.singular_values;
+    let scale = (d[0] + d[1] + mirror * d[2]) / spread;
+    let is_sound = scale.is_finite() && scale > 0.0 && rotation.is_finite();
+    is_sound.then(|| Similarity {
+        scale,
+        rotation,
+        translation: old_mean - rotation * new_mean * scale,
+    })
+}
+
+/// The same view with all its lengths times `factor`.
+pub fn rescaled(view: &View, factor: f64) -> View {
+    let mut out = view.clone();
+    let unit = Similarity {
+        scale: factor,
+        rotation: Rigid::IDENTITY.rotation,
+        translation: DVec3::ZERO,
+    };
+    transform(&mut out, &unit, view.component);
+    out
+}
