@@ -362,7 +362,12 @@ impl Fixed {
                 }
             }
             add(s, columns, columns, &own);
+            let has_focal = columns[PARAMS - 1].is_some();
             for (other, w) in block.rows.iter().zip(&cross) {
+                // All of it would fall into the upper triangle.
+                if other.view > row.view && !has_focal {
+                    continue;
+                }
                 add(
                     s,
                     columns,

@@ -423,7 +423,7 @@ mod tests {
 
     #[test]
     fn the_gradient_is_that_of_central_differences() {
-        let matched = toy(4, 3.0, 0.02).0;
+        let matched = toy(4, 1.0, 0.02).0;
         let terms = Terms::new(&matched).unwrap();
         let mut x = flattened(&matched, 1.0);
         let n = x.len();

@@ -116,25 +116,28 @@ impl Aligner {
         };
         let refined = self.refine(&mut window, pictures, given);
         let mut joined = self.windows.join(window);
-        let held = self.windows.before(&joined, self.params.history);
-        let is_worth_it = !held.is_empty() && self.params.method != AlignMethod::Off;
-        if is_worth_it {
-            let n_held = held.len();
-            let fresh = joined.views.iter().filter(|view| joined.is_new(view));
-            let mut views: Vec<View> = held.into_iter().chain(fresh.cloned()).collect();
+        let mut views = self.windows.before(&joined, self.params.history);
+        let n_held = views.len();
+        let fresh = joined.views.iter().filter(|view| joined.is_new(view));
+        views.extend(fresh.cloned());
+        if n_held > 0 {
             let given = Given {
                 n_held,
                 is_calibrated,
             };
             self.refine(&mut views, pictures, given);
-            self.windows.correct(&views[n_held..], &mut joined);
         }
+        rescale::confidence(&mut views, self.params.depth_error, n_held);
+        views[n_held..].iter_mut().for_each(|view| {
+            rescale::mask(&mut view.depth, self.params.depth_error);
+        });
+        self.windows.correct(&views[n_held..], &mut joined);
         joined.note = joined.note.or(lost).or_else(|| refined.note.clone());
         joined.refined = refined;
         joined
     }
 
-    /// Corrects the views of one window in place, in whatever frame they share.
+    /// Corrects poses of one window in place, in whatever frame they share, and scales depth to fit them.
     pub fn refine(
         &mut self,
         views: &mut [View],
@@ -204,7 +207,6 @@ pub fn refine_matched(
     let points = points(matched, &tracks, limit);
     refined.depth_factors = rescale::depth(views, matched, &points, given.n_held);
     rescale::health(views, &points);
-    rescale::confidence(views, params.depth_error, given.n_held);
     refined
 }
 

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::Matched;
 use super::depth_at;
 use super::tracks::Point;
+use crate::frame::DepthMap;
 use crate::geometry::View;
 use crate::geometry::mvs::{RawDepth, Tolerance, votes};
 use crate::geometry::two_view::median;
@@ -19,6 +20,10 @@ const MIN_CONTRADICTIONS: u8 = 2;
 const DIFFERENCE: f64 = 1.5;
 /// A depth off by its expected error lands so many px beside the start, there and back.
 const RETURN_PX: f64 = 4.0;
+/// A pixel floats when both neighbours are further off than so many expected errors, one before and one behind.
+const FLOATING: f64 = 3.0;
+/// Share of a view's depth that is not used.
+const LEAST_TRUSTED: f64 = 0.2;
 /// Others that each view is checked against: those nearest in the list, which is the order of time.
 const MAX_OTHERS: usize = 8;
 
@@ -98,6 +103,36 @@ pub fn confidence(views: &mut [View], depth_error: f64, n_held: usize) {
                 *confidence *= (agree + 1.0) / (agree + contradict + 1.0);
             }
         }
+    }
+}
+
+/// Takes the confidence of pixels that float between two surfaces, as networks put them at silhouettes, and of the
+/// least trusted of a view: only the order of a network's confidence means anything.
+pub fn mask(depth: &mut DepthMap, depth_error: f64) {
+    let (w, h) = (depth.width_px as usize, depth.height_px as usize);
+    let step = (FLOATING * depth_error) as f32;
+    let floats = |before: usize, at: usize, after: usize| {
+        let (a, d, b) = (depth.depth[before], depth.depth[at], depth.depth[after]);
+        let (low, high) = (a.min(b), a.max(b));
+        low > 0.0 && d > low * (1.0 + step) && high > d * (1.0 + step)
+    };
+    let is_floating = |at: usize| {
+        let (x, y) = (at % w, at / w);
+        let across = x > 0 && x + 1 < w && floats(at - 1, at, at + 1);
+        across || (y > 0 && y + 1 < h && floats(at - w, at, at + w))
+    };
+    let floating: Vec<usize> = (0..w * h).filter(|&at| is_floating(at)).collect();
+    floating
+        .into_iter()
+        .for_each(|at| depth.confidence[at] = 0.0);
+    let mut values: Vec<f32> = (0..w * h)
+        .filter_map(|at| Some(depth.verified(at)?.1))
+        .collect();
+    if !values.is_empty() {
+        let n = (LEAST_TRUSTED * values.len() as f64) as usize;
+        let cut = *values.select_nth_unstable_by(n, f32::total_cmp).1;
+        let low = depth.confidence.iter_mut().filter(|c| **c < cut);
+        low.for_each(|c| *c = 0.0);
     }
 }
 

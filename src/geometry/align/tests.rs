@@ -265,7 +265,7 @@ fn windows_that_do_not_fit_are_components_of_their_own_and_say_why() {
     );
     let mirror = |depth: &mut DepthMap| {
         let n = depth.depth.len();
-        let spoil = |(at, d): (usize, &mut f32)| *d *= 0.7 + 0.6 * at as f32 / n as f32;
+        let spoil = |(at, d): (usize, &mut f32)| *d *= 0.75 + 0.5 * at as f32 / n as f32;
         depth.depth.iter_mut().enumerate().for_each(spoil);
     };
     let (component, _) = component_after(|w| w.iter_mut().for_each(|v| mirror(&mut v.depth)));
@@ -281,10 +281,19 @@ fn windows_that_do_not_fit_are_components_of_their_own_and_say_why() {
 }
 
 #[test]
-fn one_lost_shared_keyframe_leaves_the_window_to_the_other() {
+fn a_lost_shared_keyframe_is_outvoted_by_two_and_not_by_one() {
     let turn = Rigid::exp(DVec3::ZERO, DVec3::X * 0.6);
-    let (component, _) = component_after(|w| w[0].batch_from_cam = w[0].batch_from_cam * turn);
-    assert_eq!(component, 0);
+    let spoil = |w: &mut Vec<View>| w[1].batch_from_cam = w[1].batch_from_cam * turn;
+    assert_eq!(component_after(spoil).0, 1);
+    let mut windows = Windows::new(&params().align);
+    let truth = walk(0..12);
+    windows.join(truth[..7].to_vec());
+    let mut second = moved(&truth[4..10], 1.2);
+    spoil(&mut second);
+    let joined = windows.join(second);
+    assert_eq!(joined.fit.unwrap().keyframe_ids, [4, 6]);
+    let shift = joined.views[5].batch_from_cam.translation - truth[9].batch_from_cam.translation;
+    assert!(shift.length() < 1e-4, "{shift}");
 }
 
 #[test]
@@ -321,4 +330,21 @@ fn depth_that_others_see_through_loses_its_confidence() {
     rescale::confidence(&mut views, 0.05, 0);
     assert_eq!(views[1].depth.confidence[at], 0.0);
     assert_eq!(views[1].depth.confidence[at + 4], 0.5);
+}
+
+#[test]
+fn floating_pixels_and_the_least_trusted_fifth_are_masked() {
+    let mut depth = walk(0..1).remove(0).depth;
+    let confidence = depth.confidence.iter_mut().enumerate();
+    confidence.for_each(|(at, c)| *c = 0.2 + 0.01 * (at % 50) as f32);
+    for row in 0..48 {
+        // A jump from 2 to 4 with one pixel between.
+        (0..64).for_each(|x| depth.depth[row * 64 + x] = [2.0, 4.0][usize::from(x > 30)]);
+        depth.depth[row * 64 + 30] = 3.0;
+    }
+    rescale::mask(&mut depth, 0.05);
+    assert!((0..48).all(|row| depth.confidence[row * 64 + 30] == 0.0));
+    let left = depth.confidence.iter().filter(|c| **c > 0.0).count() as f64;
+    let share = left / (47.0 / 48.0 * 63.0 / 64.0 * 64.0 * 48.0);
+    assert!((0.77..0.83).contains(&share), "{share}");
 }

@@ -7,7 +7,7 @@ use crate::geometry::triangulate::{Sight, triangulate, widest_angle};
 use crate::geometry::two_view::median;
 
 /// Longer tracks say more: beyond so many, the shorter ones are left.
-const MAX_TRACKS: usize = 4000;
+const MAX_TRACKS: usize = 1500;
 /// Below this angle between its rays a point's depth is mostly noise.
 const MIN_ANGLE_DEG: f64 = 1.0;
 

@@ -214,20 +214,22 @@ impl Windows {
                 "a window shares no keyframe with the ones before, so it is a component of its own";
             return Err(Some(sentence.to_owned()));
         }
+        let all: Vec<&Shared<'_>> = shared.iter().collect();
+        let mut sets = vec![all.clone()];
+        sets.extend(self.majority(&all));
         let mut faults = Vec::new();
-        let whole = &shared[..];
-        let mut ways: Vec<(&[Shared<'_>], bool)> = vec![(whole, true)];
-        if self.params.join == JoinBy::Points && shared.len() > 1 {
-            ways.insert(0, (whole, false));
-        }
-        if shared.len() > 1 {
-            // A window may have lost one shared keyframe and not the other.
-            ways.extend(shared.chunks(1).map(|one| (one, true)));
-        }
-        for (shared, is_scale_only) in ways {
-            match self.gated(shared, is_scale_only) {
-                Ok(fit) => return Ok(fit),
-                Err(fault) => faults.push(fault),
+        for set in sets {
+            let can_use_points = self.params.join == JoinBy::Points && set.len() > 1;
+            let ways: &[bool] = if can_use_points {
+                &[false, true]
+            } else {
+                &[true]
+            };
+            for is_scale_only in ways {
+                match self.gated(&set, *is_scale_only) {
+                    Ok(fit) => return Ok(fit),
+                    Err(fault) => faults.push(fault),
+                }
             }
         }
         let first = faults.into_iter().next().unwrap_or_default();
@@ -236,7 +238,23 @@ impl Windows {
         )))
     }
 
-    fn gated(&self, shared: &[Shared<'_>], is_scale_only: bool) -> Result<Fit, String> {
+    /// The shared keyframes that agree with one of them, if they are more than half: a network may have lost the
+    /// others. One alone always agrees with itself, which says nothing.
+    fn majority<'a, 'b>(&self, all: &[&'a Shared<'b>]) -> Option<Vec<&'a Shared<'b>>> {
+        let with = |one: &&'a Shared<'b>| {
+            let similarity = by_poses(&[*one])?;
+            let agrees = |s: &&'a Shared<'b>| {
+                s.turn_deg(&similarity) <= self.params.max_turn_deg
+                    && inlier_share(&[*s], &similarity) >= self.params.min_inliers
+            };
+            Some(all.iter().copied().filter(agrees).collect::<Vec<_>>())
+        };
+        let sets = all.iter().filter_map(with);
+        let largest = sets.max_by_key(Vec::len)?;
+        (largest.len() < all.len() && 2 * largest.len() > all.len()).then_some(largest)
+    }
+
+    fn gated(&self, shared: &[&Shared<'_>], is_scale_only: bool) -> Result<Fit, String> {
         let found = if is_scale_only {
             by_poses(shared)
         } else {
@@ -245,13 +263,8 @@ impl Windows {
         let Some(similarity) = found else {
             return Err("its shared keyframes have no depth in common".to_owned());
         };
-        let turn_deg = shared
-            .iter()
-            .map(|s| {
-                let laid = similarity.transform_pose(&s.new.batch_from_cam);
-                laid.angle_to(&s.old.batch_from_cam).to_degrees()
-            })
-            .fold(0.0, f64::max);
+        let turns = shared.iter().map(|s| s.turn_deg(&similarity));
+        let turn_deg = turns.fold(0.0, f64::max);
         let inliers = inlier_share(shared, &similarity);
         let (jump, params) = (similarity.scale / self.last_scale, &self.params);
         let is_near =
@@ -360,6 +373,14 @@ impl<'a> Shared<'a> {
     }
 }
 
+impl Shared<'_> {
+    /// Between its heading before and the one that the window gives it.
+    fn turn_deg(&self, running_from_window: &Similarity) -> f64 {
+        let laid = running_from_window.transform_pose(&self.new.batch_from_cam);
+        laid.angle_to(&self.old.batch_from_cam).to_degrees()
+    }
+}
+
 fn median_confidence(depth: &DepthMap) -> f64 {
     let mut values: Vec<f32> = (0..depth.depth.len())
         .filter_map(|at| Some(depth.verified(at)?.1))
@@ -371,11 +392,11 @@ fn median_confidence(depth: &DepthMap) -> f64 {
     f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-fn all_samples<'a>(shared: &'a [Shared<'_>]) -> impl Iterator<Item = &'a Sample> {
+fn all_samples<'a>(shared: &'a [&Shared<'_>]) -> impl Iterator<Item = &'a Sample> {
     shared.iter().flat_map(|s| &s.samples)
 }
 
-fn inlier_share(shared: &[Shared<'_>], similarity: &Similarity) -> f64 {
+fn inlier_share(shared: &[&Shared<'_>], similarity: &Similarity) -> f64 {
     let (mut n, mut all) = (0.0, 0.0);
     for sample in all_samples(shared) {
         all += 1.0;
@@ -388,7 +409,7 @@ fn inlier_share(shared: &[Shared<'_>], similarity: &Similarity) -> f64 {
 }
 
 /// Scale by the ratio of the depths of the same pixels, the rest by the poses.
-fn by_poses(shared: &[Shared<'_>]) -> Option<Similarity> {
+fn by_poses(shared: &[&Shared<'_>]) -> Option<Similarity> {
     let mut ratios: Vec<(f64, f64)> = all_samples(shared)
         .map(|s| (s.log_ratio, s.weight))
         .collect();
@@ -428,7 +449,7 @@ fn mean_rotation(rotations: impl Iterator<Item = DQuat>) -> Option<DQuat> {
 }
 
 /// Weighted similarity between the surfaces, reweighted by Huber's loss.
-fn by_points(shared: &[Shared<'_>]) -> Option<Similarity> {
+fn by_points(shared: &[&Shared<'_>]) -> Option<Similarity> {
     let samples: Vec<&Sample> = all_samples(shared).collect();
     if samples.len() < MIN_SAMPLES {
         return None;
