@@ -9,9 +9,9 @@ use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
 
 use super::Matched;
-use super::tracks::{Track, sight};
+use super::bundle_state::{Depths, State};
+use super::tracks::Track;
 use crate::camera::Intrinsics;
-use crate::geometry::triangulate::triangulate;
 use crate::pose::Rigid;
 
 /// Pose, log-scale of the view's depth, log-focal.
@@ -30,9 +30,6 @@ pub struct Settings {
     pub depth_error: f64,
     pub moves_focal: bool,
 }
-
-/// What depth each feature of each view has; `None` where the network gave none.
-pub type Depths = Vec<Vec<Option<f64>>>;
 
 /// Moves the poses that are not held, and the focal length if asked. Returns each view's log-scale.
 pub fn align(
@@ -56,50 +53,6 @@ pub fn align(
         }
     }
     state.log_scales
-}
-
-#[derive(Debug, Clone)]
-struct State {
-    poses: Vec<Rigid>,
-    log_scales: Vec<f64>,
-    log_focal: f64,
-    points: Vec<DVec3>,
-    tracks: Vec<Track>,
-}
-
-impl State {
-    /// Points start where the depth of their sights puts them on average: rays of poses that are a degree off hardly meet.
-    fn new(matched: &Matched, tracks: &[Track], depths: &Depths) -> Self {
-        let mut state = Self {
-            poses: matched.shots.iter().map(|s| s.cam_from_batch).collect(),
-            log_scales: vec![0.0; matched.shots.len()],
-            log_focal: 0.0,
-            points: Vec::new(),
-            tracks: Vec::new(),
-        };
-        for track in tracks {
-            let by_depth: Vec<DVec3> = track
-                .iter()
-                .filter_map(|&(view, feature)| {
-                    let shot = &matched.shots[view];
-                    let depth = depths[view][feature]?;
-                    let in_cam = shot.lens.ray_in_cam(shot.pixels[feature]) * depth;
-                    Some(shot.cam_from_batch.inverse().transform_point(in_cam))
-                })
-                .collect();
-            let point = if by_depth.is_empty() {
-                let sights: Vec<_> = track.iter().map(|&at| sight(matched, at)).collect();
-                triangulate(&sights)
-            } else {
-                Some(by_depth.iter().sum::<DVec3>() / by_depth.len() as f64)
-            };
-            if let Some(point) = point.filter(|p| p.is_finite()) {
-                state.points.push(point);
-                state.tracks.push(track.clone());
-            }
-        }
-        state
-    }
 }
 
 /// One sight of one point.

@@ -3,10 +3,13 @@
 //!
 //! docs/ALIGNMENT.md has the procedures, the noise that they are measured with and the figures.
 
+pub mod bundle_state;
 pub mod depth_bundle;
 pub mod epipolar;
+mod line_distance;
 pub mod matches;
 pub mod noise;
+mod overlap;
 pub mod rescale;
 #[cfg(test)]
 mod tests;
@@ -18,7 +21,7 @@ use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
-use self::depth_bundle::Depths;
+use self::bundle_state::Depths;
 use self::matches::Matcher;
 use self::tracks::{points, tracks};
 use self::window::{Joined, Windows};
@@ -30,8 +33,9 @@ use crate::geometry::features::FeaturesError;
 use crate::geometry::two_view::median;
 use crate::pose::Rigid;
 
-/// A corrected window whose matches fit worse than this many times before is put back.
-const MAX_WORSE: f64 = 1.0;
+/// A correction after which the matches fit worse than before by this factor is put back. Not 1: a window that fits
+/// well within itself may give a hundredth of a pixel for its fit with the views that are held.
+const MAX_WORSE: f64 = 1.5;
 /// Reprojection error up to which a triangulated point is one, in pixels of a picture of 640.
 const MAX_POINT_ERROR_PX: f64 = 3.0;
 
@@ -200,7 +204,9 @@ pub fn refine_matched(
     if refined.after_px.is_none() || !is_better {
         matched.shots = original;
         refined.after_px = before_px;
-        refined.note = Some("no correction makes the window's matches fit better".to_owned());
+        refined.note = Some(
+            "the correction made the window's matches fit worse, so its poses stay".to_owned(),
+        );
     }
     write_back(views, matched);
     let limit = MAX_POINT_ERROR_PX * longest_px(matched) / 640.0;
