@@ -61,6 +61,7 @@ pub struct Params {
     pub known: KnownParams,
     pub sfm: SfmParams,
     pub mvs: MvsParams,
+    pub align: AlignParams,
     pub map: MapParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
@@ -114,6 +115,9 @@ pub struct KnownParams {
     pub offset_deg: f64,
     pub offset_extent: f64,
     pub depth_noise: f64,
+    pub windows: bool,
+    pub window_scale: f64,
+    pub depth_outliers: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -154,6 +158,38 @@ pub struct MvsParams {
     pub n_sources: usize,
     pub min_views: usize,
     pub backend: Backend,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AlignMethod {
+    Off,
+    Epipolar,
+    Bundle,
+    Both,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum JoinBy {
+    Points,
+    Poses,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AlignParams {
+    pub method: AlignMethod,
+    pub steps: usize,
+    pub max_pair_deg: f64,
+    pub max_matches: usize,
+    pub principal_point: bool,
+    pub depth_error: f64,
+    pub join: JoinBy,
+    pub history: usize,
+    pub min_inliers: f64,
+    pub max_scale_jump: f64,
+    pub max_turn_deg: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

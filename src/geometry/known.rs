@@ -6,13 +6,16 @@
 //! would lie several pixels beside the lines on which stereo looks for them.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::DVec3;
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
-use crate::config::{KnownParams, MvsParams, SfmParams};
+use crate::config::{AlignParams, KnownParams, MvsParams, SfmParams};
 use crate::frame::{Batch, DepthMap, Keyframe};
+use crate::geometry::align::Aligner;
+use crate::geometry::align::noise::{Noise, answer, normal, normal3};
 use crate::geometry::sfm::posed::PosedStereo;
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, Health, PoseError, View};
 use crate::pose::Rigid;
@@ -34,6 +37,8 @@ pub struct Known {
     /// By keyframe id: the pose that was given out, and the generator as drawing it left it. A shared keyframe gets
     /// the same noise in every batch, even when its depth and so its median changes.
     disturbed: BTreeMap<u32, (Rigid, Pcg64Mcg)>,
+    /// With `known.windows`: what a foundation model's answers go through.
+    aligner: Option<Aligner>,
 }
 
 impl Known {
@@ -58,29 +63,78 @@ impl Known {
             extent: extent.unwrap_or(0.0),
             stereo: PosedStereo::new(sfm, mvs, seed)?,
             disturbed: BTreeMap::new(),
+            aligner: None,
         })
+    }
+
+    /// Answers each batch as a foundation model does, if `known.windows` asks for it: in a frame and unit of its own,
+    /// with fresh noise, then corrected and joined.
+    pub fn in_windows(
+        mut self,
+        align: &AlignParams,
+        sfm: &SfmParams,
+    ) -> Result<Self, GeometryError> {
+        if self.params.windows {
+            self.aligner = Some(Aligner::new(align, sfm, self.seed)?);
+        }
+        Ok(self)
+    }
+
+    fn infer_window(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
+        let views = self.true_views(batch)?;
+        let window = answer(
+            &views,
+            &self.noise(),
+            self.seed ^ (u64::from(batch.id) << 24),
+        );
+        let pictures = batch.keyframes.iter();
+        let pictures = pictures
+            .map(|k| (k.id, Arc::clone(&k.frame.image)))
+            .collect();
+        let Some(aligner) = &mut self.aligner else {
+            return Ok(GeometryBatch::default());
+        };
+        let joined = aligner.place(window, &pictures, true);
+        tracing::debug!(batch = batch.id, fit = ?joined.fit, refined = ?joined.refined, "window");
+        Ok(GeometryBatch {
+            batch_id: batch.id,
+            views: joined.views,
+            note: joined.note,
+            ..GeometryBatch::default()
+        })
+    }
+
+    /// Views of this batch as they are, in the order of the batch.
+    fn true_views(&mut self, batch: &Batch) -> Result<Vec<View>, GeometryError> {
+        let mut views = exact_views(batch)?;
+        if views.len() < batch.keyframes.len() {
+            let by_stereo = self.views_by_stereo(batch)?.views;
+            let is_wanted = |view: &View| {
+                let is_ready = views.iter().any(|v| v.keyframe_id == view.keyframe_id);
+                !is_ready && batch.keyframes.iter().any(|k| k.id == view.keyframe_id)
+            };
+            let wanted: Vec<View> = by_stereo.into_iter().filter(is_wanted).collect();
+            views.extend(wanted);
+            views.sort_by_key(|view| view.keyframe_id);
+        }
+        Ok(views)
+    }
+
+    fn noise(&self) -> Noise {
+        let params = &self.params;
+        Noise {
+            scale: params.window_scale,
+            rotation_deg: params.rotation_noise_deg,
+            translation: params.translation_noise,
+            depth: params.depth_noise,
+            outliers: params.depth_outliers,
+        }
     }
 
     /// Views that need no stereo: with the exact depth of their recording, or held out and without any.
     fn views_without_stereo(&mut self, batch: &Batch) -> Result<Vec<View>, GeometryError> {
-        let mut views = Vec::new();
-        for keyframe in &batch.keyframes {
-            let held_out = keyframe.frame.is_held_out.then(DepthMap::none);
-            let exact = keyframe.frame.truth_depth.as_deref().cloned();
-            if let Some(depth) = exact.or(held_out) {
-                let view = View {
-                    keyframe_id: keyframe.id,
-                    component: 0,
-                    intrinsics: keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?,
-                    lens: None,
-                    batch_from_cam: truth_of(keyframe)?,
-                    depth,
-                    health: Health::default(),
-                };
-                views.push(self.disturb(view));
-            }
-        }
-        Ok(views)
+        let exact = exact_views(batch)?;
+        Ok(exact.into_iter().map(|view| self.disturb(view)).collect())
     }
 
     /// Views with depth by stereo, of this batch and revised ones of earlier batches.
@@ -148,6 +202,9 @@ impl Known {
 
 impl GeometryModel for Known {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
+        if self.aligner.is_some() {
+            return self.infer_window(batch);
+        }
         let ready = self.views_without_stereo(batch)?;
         if ready.len() == batch.keyframes.len() {
             return Ok(GeometryBatch {
@@ -168,11 +225,35 @@ impl GeometryModel for Known {
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
+        if self.aligner.is_some() {
+            return Ok(GeometryBatch::default());
+        }
         let mut answer = self.stereo.finish();
         answer.views = answer.views.into_iter().map(|v| self.disturb(v)).collect();
         answer.pose_error = self.pose_error(&answer.views);
         Ok(answer)
     }
+}
+
+/// Views that need no stereo, as they are.
+fn exact_views(batch: &Batch) -> Result<Vec<View>, GeometryError> {
+    let mut views = Vec::new();
+    for keyframe in &batch.keyframes {
+        let held_out = keyframe.frame.is_held_out.then(DepthMap::none);
+        let exact = keyframe.frame.truth_depth.as_deref().cloned();
+        if let Some(depth) = exact.or(held_out) {
+            let view = View {
+                keyframe_id: keyframe.id,
+                component: 0,
+                intrinsics: keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?,
+                batch_from_cam: truth_of(keyframe)?,
+                depth,
+                health: Health::default(),
+            };
+            views.push(view);
+        }
+    }
+    Ok(views)
 }
 
 fn truth_of(keyframe: &Keyframe) -> Result<Rigid, GeometryError> {
@@ -205,15 +286,4 @@ fn add_noise(depth: &mut DepthMap, std: f32, rng: &mut Pcg64Mcg) {
             *value *= (1.0 + std * normal(rng) as f32).max(0.05);
         }
     }
-}
-
-fn normal3(rng: &mut Pcg64Mcg) -> DVec3 {
-    DVec3::new(normal(rng), normal(rng), normal(rng))
-}
-
-/// Standard normal (Box and Muller 1958).
-fn normal(rng: &mut Pcg64Mcg) -> f64 {
-    let u: f64 = 1.0 - rng.random::<f64>();
-    let v: f64 = rng.random::<f64>();
-    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }

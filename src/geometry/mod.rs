@@ -1,5 +1,6 @@
 //! A batch of keyframes -> cameras, depth and confidence, in the model's own frame and scale.
 
+pub mod align;
 pub mod bundle;
 pub mod features;
 pub mod focal;

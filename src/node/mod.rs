@@ -125,15 +125,22 @@ fn model(
             Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
             ScaleSource::UpToScale,
         )),
-        "known" => Ok((
-            Box::new(Known::new(
+        "known" => {
+            let known = Known::new(
                 params.known.clone(),
                 (&params.sfm, &params.mvs),
                 truth_extent,
                 params.seed,
-            )?),
-            ScaleSource::Given,
-        )),
+            )?;
+            // Windows have units of their own, as a foundation model's have.
+            let scale = if params.known.windows {
+                ScaleSource::UpToScale
+            } else {
+                ScaleSource::Given
+            };
+            let known = known.in_windows(&params.align, &params.sfm)?;
+            Ok((Box::new(known), scale))
+        }
         name if name.starts_with("onnx:") => {
             bail!("this build has no ONNX Runtime; use --geometry sfm: {name}")
         }

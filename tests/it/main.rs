@@ -5,6 +5,7 @@
 )]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+mod alignment;
 mod backends;
 mod bags;
 mod declared_lengths;

@@ -10,10 +10,20 @@ use crate::config::MvsParams;
 use crate::frame::DepthMap;
 use crate::pose::Rigid;
 
-/// There and back again must land this close to the start, in pixels of the depth map.
-const MAX_RETURN_PX: f64 = 1.5;
-/// And at this depth, relative.
-const MAX_DEPTH_ERROR: f64 = 0.02;
+/// How close two views must come to agree.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tolerance {
+    /// There and back again must land this close to the start, in pixels of the depth map.
+    pub return_px: f64,
+    /// And at this depth, relative.
+    pub depth: f64,
+}
+
+/// Of matched depth.
+const STEREO: Tolerance = Tolerance {
+    return_px: 1.5,
+    depth: 0.02,
+};
 /// Four depths this far apart (relative) lie on different surfaces: no value between them.
 const SURFACE_GAP: f32 = 0.03;
 /// Views from nearly the same place agree on any depth.
@@ -107,34 +117,89 @@ fn agreement(
     depth: f64,
     others: &[Other<'_>],
 ) -> Agreement {
-    let point = intrinsics.ray_in_cam(pixel) * depth;
     let (mut n, mut sum) = (0, depth);
     for other in others {
-        let in_other = other.rotation * point + other.translation;
-        if other.translation.length_squared() < (MIN_ANGLE_RAD * depth).powi(2) {
-            continue;
-        }
-        let Some(at) = other.raw.intrinsics.project(in_other) else {
-            continue;
-        };
-        let Some(seen) = depth_at(other.raw, at) else {
-            continue;
-        };
-        let seen = other.raw.intrinsics.ray_in_cam(at) * f64::from(seen);
-        let back = other.rotation.transpose() * (seen - other.translation);
-        let Some(landed) = intrinsics.project(back) else {
-            continue;
-        };
-        let is_near = (landed - pixel).length_squared() < MAX_RETURN_PX * MAX_RETURN_PX;
-        if is_near && (back.z - depth).abs() < MAX_DEPTH_ERROR * depth {
+        if let Verdict::Agrees(back) = other.verdict(intrinsics, pixel, depth, STEREO) {
             n += 1;
-            sum += back.z;
+            sum += back;
         }
     }
     Agreement {
         n,
         depth: sum / (n + 1) as f64,
     }
+}
+
+/// What another view says of a depth.
+enum Verdict {
+    /// And has it at this depth itself.
+    Agrees(f64),
+    /// It sees through the point.
+    Contradicts,
+    /// The point is hidden from it, or outside its picture.
+    Silent,
+}
+
+impl Other<'_> {
+    fn verdict(
+        &self,
+        intrinsics: &Intrinsics,
+        pixel: glam::DVec2,
+        depth: f64,
+        tolerance: Tolerance,
+    ) -> Verdict {
+        let in_other = self.rotation * (intrinsics.ray_in_cam(pixel) * depth) + self.translation;
+        if self.translation.length_squared() < (MIN_ANGLE_RAD * depth).powi(2) {
+            return Verdict::Silent;
+        }
+        let Some(at) = self.raw.intrinsics.project(in_other) else {
+            return Verdict::Silent;
+        };
+        let Some(found) = depth_at(self.raw, at) else {
+            return Verdict::Silent;
+        };
+        let seen = self.raw.intrinsics.ray_in_cam(at) * f64::from(found);
+        let back = self.rotation.transpose() * (seen - self.translation);
+        let is_near = intrinsics
+            .project(back)
+            .is_some_and(|landed| (landed - pixel).length_squared() < tolerance.return_px.powi(2));
+        if is_near && (back.z - depth).abs() < tolerance.depth * depth {
+            return Verdict::Agrees(back.z);
+        }
+        if f64::from(found) > in_other.z * (1.0 + tolerance.depth) {
+            return Verdict::Contradicts;
+        }
+        Verdict::Silent
+    }
+}
+
+/// For each pixel how many of the others agree with its depth, and how many see through it.
+pub(super) fn votes(
+    reference: (Rigid, &RawDepth),
+    others: &[(Rigid, &RawDepth)],
+    tolerance: Tolerance,
+) -> Vec<[u8; 2]> {
+    let (world_from_cam, raw) = reference;
+    let width = raw.intrinsics.width_px as usize;
+    let others: Vec<Other<'_>> = others
+        .iter()
+        .filter_map(|(pose, other)| Other::new(&world_from_cam, pose, other))
+        .collect();
+    let vote = |(at, depth): (usize, &f32)| {
+        let mut counts = [0_u8; 2];
+        if *depth > 0.0 && depth.is_finite() {
+            let pixel = glam::DVec2::new((at % width) as f64 + 0.5, (at / width) as f64 + 0.5);
+            for other in &others {
+                match other.verdict(&raw.intrinsics, pixel, f64::from(*depth), tolerance) {
+                    Verdict::Agrees(_) => counts[0] = counts[0].saturating_add(1),
+                    Verdict::Contradicts => counts[1] = counts[1].saturating_add(1),
+                    Verdict::Silent => {}
+                }
+            }
+        }
+        counts
+    };
+    raw.depth.par_iter().enumerate().map(vote).collect()
 }
 
 /// Depth between the four nearest pixels where they lie on one surface, else of the nearest pixel.

@@ -19,6 +19,8 @@ mod zncc;
 
 use std::sync::Arc;
 
+pub use consistency::Tolerance;
+
 use crate::camera::Intrinsics;
 use crate::config::MvsParams;
 use crate::frame::{DepthMap, RgbImage};
@@ -80,6 +82,15 @@ pub fn verify(
         .map(|(view, raw)| (view.world_from_cam, *raw))
         .collect();
     consistency::verify((reference.0.world_from_cam, reference.1), &others, params)
+}
+
+/// For each pixel of `reference` how many of `others` agree with its depth, and how many see through it.
+pub fn votes(
+    reference: (Rigid, &RawDepth),
+    others: &[(Rigid, &RawDepth)],
+    tolerance: Tolerance,
+) -> Vec<[u8; 2]> {
+    consistency::votes(reference, others, tolerance)
 }
 
 /// What matching needs of a view: grey, at the size of the depth map.

@@ -1,0 +1,247 @@
+//! Views with rough poses and their pictures -> verified matches between those that may see the same surface.
+//!
+//! Features and matches are remembered by keyframe, so that shared keyframes cost nothing twice.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+use super::{Matched, Pair, Shot};
+use crate::config::{AlignParams, SfmParams};
+use crate::frame::RgbImage;
+use crate::geometry::View;
+use crate::geometry::features::{Features, FeaturesError, Finder, working_picture, working_size};
+use crate::geometry::matching::{Comparable, matches};
+use crate::geometry::two_view::motion;
+
+/// Matches that a pair needs; fewer are as likely chance.
+const MIN_PAIR: usize = 15;
+/// Pairs of one view: those turned least against each other.
+const MAX_PAIRS: usize = 12;
+/// Share of a view's surface inside another picture from which they are a pair however far they are turned.
+const MIN_SHARED: f64 = 0.3;
+/// Depths of a view that stand for its surface, along each side.
+const GRID: usize = 12;
+/// Keyframes whose features are remembered.
+const MAX_HELD: usize = 64;
+/// Longer side of the picture that `sfm.max_error_px` is meant for.
+const ERROR_SIDE_PX: f64 = 640.0;
+/// The focal length that verification rests on is the network's, so it is laxer than with a calibrated camera.
+const LAXITY: f64 = 1.5;
+
+/// Matches of features, by number.
+type Numbers = Vec<(u32, u32)>;
+
+/// Finds and remembers features of keyframes and the matches between them.
+#[derive(Debug)]
+pub struct Matcher {
+    finder: Finder,
+    max_features: usize,
+    max_side: u32,
+    max_error_px: f64,
+    seed: u64,
+    held: BTreeMap<u32, Held>,
+    /// By keyframe ids in rising order; empty where two do not match.
+    pairs: BTreeMap<(u32, u32), Numbers>,
+}
+
+#[derive(Debug)]
+struct Held {
+    features: Features,
+    comparable: Comparable,
+    size: (u32, u32),
+}
+
+impl Matcher {
+    /// An error where the parameters name a network for features that is not there.
+    pub fn new(sfm: &SfmParams, seed: u64) -> Result<Self, FeaturesError> {
+        Ok(Self {
+            finder: Finder::new(sfm)?,
+            max_features: sfm.max_features,
+            max_side: sfm.max_side,
+            max_error_px: sfm.max_error_px,
+            seed,
+            held: BTreeMap::new(),
+            pairs: BTreeMap::new(),
+        })
+    }
+
+    /// Features of the views and the matches between them; a view whose keyframe has no picture in `pictures` and is
+    /// not remembered has none.
+    pub fn matched(
+        &mut self,
+        views: &[View],
+        pictures: &BTreeMap<u32, Arc<RgbImage>>,
+        params: &AlignParams,
+    ) -> Matched {
+        self.look(views, pictures);
+        let candidates = candidates(views, params.max_pair_deg);
+        let id = |ix: usize| views[ix].keyframe_id;
+        let fresh: Vec<(usize, usize)> = candidates
+            .iter()
+            .copied()
+            .filter(|&(a, b)| !self.pairs.contains_key(&key(id(a), id(b))))
+            .collect();
+        let found: Vec<((u32, u32), Numbers)> = fresh
+            .par_iter()
+            .map(|&(a, b)| {
+                let (a, b) = if id(a) < id(b) { (a, b) } else { (b, a) };
+                let found = self.verified([&views[a], &views[b]], params.max_matches);
+                ((id(a), id(b)), found)
+            })
+            .collect();
+        self.pairs.extend(found);
+        let pair = |&(first, second): &(usize, usize)| {
+            let found = self.pairs.get(&key(id(first), id(second)))?;
+            let is_flipped = id(first) > id(second);
+            let turned = |&(i, j): &(u32, u32)| if is_flipped { (j, i) } else { (i, j) };
+            (!found.is_empty()).then(|| Pair {
+                first,
+                second,
+                features: found.iter().map(turned).collect(),
+            })
+        };
+        Matched {
+            pairs: candidates.iter().filter_map(pair).collect(),
+            shots: views.iter().map(|view| self.shot(view)).collect(),
+        }
+    }
+
+    fn look(&mut self, views: &[View], pictures: &BTreeMap<u32, Arc<RgbImage>>) {
+        let fresh: Vec<(u32, &Arc<RgbImage>)> = views
+            .iter()
+            .filter(|view| !self.held.contains_key(&view.keyframe_id))
+            .filter_map(|view| Some((view.keyframe_id, pictures.get(&view.keyframe_id)?)))
+            .collect();
+        let look = |(id, image): &(u32, &Arc<RgbImage>)| {
+            let picture = working_picture(image, self.max_side);
+            let features = self.finder.features(&picture, self.max_features);
+            let held = Held {
+                comparable: Comparable::new(&features.descriptors),
+                features,
+                size: (picture.width as u32, picture.height as u32),
+            };
+            (*id, held)
+        };
+        let found: Vec<(u32, Held)> = fresh.par_iter().map(look).collect();
+        self.held.extend(found);
+        while self.held.len() > MAX_HELD.max(views.len()) {
+            let oldest = self.held.keys().copied().find(|id| {
+                let is_needed = views.iter().any(|view| view.keyframe_id == *id);
+                !is_needed
+            });
+            let Some(oldest) = oldest else { break };
+            self.held.remove(&oldest);
+            self.pairs.retain(|(a, b), _| *a != oldest && *b != oldest);
+        }
+    }
+
+    fn shot(&self, view: &View) -> Shot {
+        let i = &view.intrinsics;
+        let held = self.held.get(&view.keyframe_id);
+        let size = held.map_or_else(
+            || working_size(i.width_px, i.height_px, self.max_side),
+            |held| held.size,
+        );
+        Shot {
+            cam_from_batch: view.batch_from_cam.inverse(),
+            lens: i.resized(size.0, size.1),
+            is_held: false,
+            pixels: held.map_or_else(Vec::new, |held| held.features.pixels.clone()),
+        }
+    }
+
+    /// Matches of two views, the one with the lower id first, that agree with one rigid scene.
+    fn verified(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
+        let (Some(first), Some(second)) =
+            (self.held.get(&a.keyframe_id), self.held.get(&b.keyframe_id))
+        else {
+            return Vec::new();
+        };
+        let mut raw = matches(&first.comparable, &second.comparable);
+        raw.truncate(max_matches);
+        if raw.len() < MIN_PAIR {
+            return Vec::new();
+        }
+        let pixels = |&(i, j): &(u32, u32)| -> (DVec2, DVec2) {
+            (
+                first.features.pixels[i as usize],
+                second.features.pixels[j as usize],
+            )
+        };
+        let pairs: Vec<_> = raw.iter().map(pixels).collect();
+        let lenses = [
+            a.intrinsics.resized(first.size.0, first.size.1),
+            b.intrinsics.resized(second.size.0, second.size.1),
+        ];
+        let longest = f64::from(first.size.0.max(first.size.1));
+        let limit = LAXITY * self.max_error_px * longest / ERROR_SIDE_PX;
+        let seed = self.seed ^ (u64::from(a.keyframe_id) << 32 | u64::from(b.keyframe_id));
+        let Some(found) = motion(&pairs, [&lenses[0], &lenses[1]], limit, seed) else {
+            return Vec::new();
+        };
+        let agreeing: Numbers = found.inliers.iter().map(|&i| raw[i]).collect();
+        if agreeing.len() < MIN_PAIR {
+            return Vec::new();
+        }
+        agreeing
+    }
+}
+
+fn key(a: u32, b: u32) -> (u32, u32) {
+    (a.min(b), a.max(b))
+}
+
+/// Pairs (first < second) turned by less than `max_pair_deg`, or that look at the same surface: for each view the
+/// ones turned least, so that the number grows with the views and not with their square.
+pub fn candidates(views: &[View], max_pair_deg: f64) -> Vec<(usize, usize)> {
+    let n = views.len();
+    let mut chosen = Vec::new();
+    let angle = |i: usize, j: usize| views[i].batch_from_cam.angle_to(&views[j].batch_from_cam);
+    for i in 0..n {
+        let mut near: Vec<(f64, usize)> = (0..n)
+            .filter(|&j| j != i && views[j].component == views[i].component)
+            .map(|j| (angle(i, j), j))
+            .filter(|&(angle, j)| {
+                angle < max_pair_deg.to_radians()
+                    || shared_surface(&views[i], &views[j]) > MIN_SHARED
+            })
+            .collect();
+        near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        near.truncate(MAX_PAIRS);
+        chosen.extend(near.into_iter().map(|(_, j)| (i.min(j), i.max(j))));
+    }
+    chosen.sort_unstable();
+    chosen.dedup();
+    chosen
+}
+
+/// Share of the surface of `a` that lies inside the picture of `b`.
+fn shared_surface(a: &View, b: &View) -> f64 {
+    let (width, height) = (a.depth.width_px as usize, a.depth.height_px as usize);
+    let lens = a.intrinsics.resized(a.depth.width_px, a.depth.height_px);
+    let b_from_a = b.batch_from_cam.inverse() * a.batch_from_cam;
+    let (mut inside, mut all) = (0.0, 0.0);
+    for cell in 0..GRID * GRID {
+        let x = (cell % GRID * 2 + 1) * width / (2 * GRID);
+        let y = (cell / GRID * 2 + 1) * height / (2 * GRID);
+        let Some((depth, _)) = a.depth.verified(y * width + x) else {
+            continue;
+        };
+        let pixel = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
+        let point: DVec3 = lens.ray_in_cam(pixel) * f64::from(depth);
+        all += 1.0;
+        let landed = b.intrinsics.project(b_from_a.transform_point(point));
+        let (w, h) = (
+            f64::from(b.intrinsics.width_px),
+            f64::from(b.intrinsics.height_px),
+        );
+        let is_inside = |p: DVec2| p.x >= 0.0 && p.y >= 0.0 && p.x < w && p.y < h;
+        if landed.is_some_and(is_inside) {
+            inside += 1.0;
+        }
+    }
+    if all > 0.0 { inside / all } else { 0.0 }
+}
