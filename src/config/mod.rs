@@ -61,6 +61,7 @@ pub struct Params {
     pub known: KnownParams,
     pub sfm: SfmParams,
     pub mvs: MvsParams,
+    pub onnx: OnnxParams,
     pub map: MapParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
@@ -146,6 +147,27 @@ pub struct MvsParams {
     pub n_sources: usize,
     pub min_views: usize,
     pub backend: Backend,
+}
+
+/// Whose focal length counts where a frame has a calibration and a model predicts one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum IntrinsicsFrom {
+    Auto,
+    Model,
+    Camera,
+}
+
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OnnxParams {
+    pub providers: String,
+    pub threads: usize,
+    pub window: usize,
+    pub window_overlap: usize,
+    pub intrinsics: IntrinsicsFrom,
+    pub rotation_error_deg: f64,
+    pub translation_error: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

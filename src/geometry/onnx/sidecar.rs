@@ -1,0 +1,158 @@
+//! `NAME.json` beside `NAME.onnx` -> what the numbers of the network mean.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use crate::geometry::onnx::ModelError;
+
+/// The contract that this program speaks.
+pub const CONTRACT: u64 = 1;
+/// A description is some hundred bytes long.
+const MAX_BYTES: u64 = 64 * 1024;
+/// Longer sides are for no network in use; a picture of 4096x4096 already takes 200 MB.
+pub const MAX_SIDE_PX: u32 = 4096;
+/// Frames of one call.
+pub const MAX_FRAMES: usize = 1024;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Family {
+    Vggt,
+    Da3,
+    Mock,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InputNorm {
+    /// From 0 to 1, as they are.
+    Unit,
+    /// Less the mean and over the deviation of the ImageNet pictures.
+    Imagenet,
+}
+
+/// Which way the pose of `pose_enc` leads.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PoseKind {
+    /// World to camera.
+    W2c,
+    /// Camera to world.
+    C2w,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum QuaternionOrder {
+    Xyzw,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RefFrame {
+    First,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    F32,
+    F16,
+}
+
+/// How a picture of another size is brought to the size of the network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preprocess {
+    /// Stretched, where that distorts by less than a patch, else as `Pad`.
+    #[default]
+    Ratio,
+    /// Stretched, where that distorts by less than a patch, else what sticks out is cut off.
+    Crop,
+    /// All of it, with white bars.
+    Pad,
+}
+
+/// What the JSON file says. Keys that are not here are no fault: later exports may say more.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct Sidecar {
+    pub family: Family,
+    pub height: u32,
+    pub width: u32,
+    pub patch: u32,
+    pub input_norm: InputNorm,
+    pub pose: PoseKind,
+    pub quat: QuaternionOrder,
+    pub ref_frame: RefFrame,
+    pub s_min: usize,
+    pub s_max: usize,
+    pub precision: Precision,
+    pub licence: String,
+    #[serde(default)]
+    pub preprocess: Preprocess,
+    /// Attention heads of the layers that look at all frames; 0 where the file does not say.
+    #[serde(default)]
+    pub heads: u32,
+}
+
+impl Sidecar {
+    pub fn path_of(model: &Path) -> PathBuf {
+        model.with_extension("json")
+    }
+
+    /// The description beside a model.
+    pub fn read(model: &Path) -> Result<Self, ModelError> {
+        let path = Self::path_of(model);
+        let fail = |reason: String| ModelError::Sidecar {
+            reason,
+            path: path.clone(),
+        };
+        let mut bytes = Vec::new();
+        std::fs::File::open(&path)
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+            .map_err(|e| fail(e.to_string()))?;
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(fail(format!("it is longer than {MAX_BYTES} bytes")));
+        }
+        Self::parse(&bytes).map_err(fail)
+    }
+
+    /// The reason, where it is none.
+    pub fn parse(bytes: &[u8]) -> Result<Self, String> {
+        let value: Value = serde_json::from_slice(bytes).map_err(|e| e.to_string())?;
+        // The number comes first: what other versions say about the rest is their own.
+        match value.get("contract").map(Value::as_u64) {
+            Some(Some(CONTRACT)) => {}
+            _ => {
+                let found = value.get("contract").unwrap_or(&Value::Null);
+                return Err(format!("contract is {found}, expected {CONTRACT}"));
+            }
+        }
+        let sidecar: Self = serde_json::from_value(value).map_err(|e| e.to_string())?;
+        sidecar.fault().map_or(Ok(sidecar), Err)
+    }
+
+    fn fault(&self) -> Option<String> {
+        let side = |name: &str, side: u32| {
+            let fits = self.patch > 0
+                && (1..=MAX_SIDE_PX).contains(&side)
+                && side.is_multiple_of(self.patch);
+            (!fits).then(|| {
+                let patch = self.patch;
+                format!(
+                    "{name} is {side}, expected a multiple of patch {patch} up to {MAX_SIDE_PX}"
+                )
+            })
+        };
+        let (least, most) = (self.s_min, self.s_max);
+        let frames = (least == 0 || least > most || !(2..=MAX_FRAMES).contains(&most)).then(|| {
+            format!("s_min is {least} and s_max {most}, expected 1 <= s_min <= s_max and s_max from 2 to {MAX_FRAMES}")
+        });
+        side("height", self.height)
+            .or_else(|| side("width", self.width))
+            .or(frames)
+    }
+}
