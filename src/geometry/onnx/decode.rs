@@ -16,6 +16,13 @@ const MAX_LENGTH: f64 = 1e9;
 /// Rounding of `1 + exp(x)` in half precision.
 const MIN_CONFIDENCE: f32 = 0.999;
 
+/// Depths that differ by less, all over a window, are no scene but a network that says nothing.
+const MIN_SPREAD: f32 = 1e-3;
+/// Pixels whose confidence is less than this share of the median are not used (VGGT-Long).
+const MIN_TRUST: f32 = 0.1;
+/// Pixels of a window that its quantiles are taken from.
+const MAX_SAMPLES: usize = 100_000;
+
 /// What came out of the network for one window, frame after frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
@@ -111,6 +118,49 @@ impl Answer {
     }
 }
 
+impl Answer {
+    /// Whether nine tenths of the depths of these frames are the same.
+    pub fn is_flat(&self, frames: &[usize]) -> bool {
+        let depths = self.samples(frames, &self.depth);
+        let at = |share: usize| depths.get(depths.len().saturating_sub(1) * share / 20);
+        at(1)
+            .zip(at(19))
+            .is_none_or(|(near, far)| far / near < 1.0 + MIN_SPREAD)
+    }
+
+    /// Of all pixels of these frames; confidences of one window share one scale.
+    pub fn median_confidence(&self, frames: &[usize]) -> f32 {
+        let all = self.samples(frames, &self.depth_conf);
+        all.get(all.len() / 2).copied().unwrap_or(1.0)
+    }
+
+    /// Evenly spread and sorted.
+    fn samples(&self, frames: &[usize], of: &[f32]) -> Vec<f32> {
+        let n = self.width * self.height;
+        let stride = (frames.len() * n).div_ceil(MAX_SAMPLES).max(1);
+        let all = frames
+            .iter()
+            .flat_map(|frame| &of[frame * n..(frame + 1) * n]);
+        let mut samples: Vec<f32> = all.step_by(stride).copied().collect();
+        samples.sort_by(f32::total_cmp);
+        samples
+    }
+}
+
+/// A model's confidence, from 1 up without end -> ours, from 0 to 1: the share of the median of the window, of which
+/// more counts no more. A model that is equally sure everywhere is trusted everywhere.
+pub fn trust(confidence: f32, median: f32) -> f32 {
+    let share = (confidence - 1.0) / (median - 1.0);
+    if median <= 1.0 {
+        return 1.0;
+    }
+    if share < MIN_TRUST {
+        0.0
+    } else {
+        share.min(1.0)
+    }
+}
+
 fn camera(
     numbers: &[f32],
     kind: PoseKind,
@@ -142,4 +192,105 @@ fn camera(
         fx: 0.5 * width as f64 / (0.5 * fov_w).tan(),
         fy: 0.5 * height as f64 / (0.5 * fov_h).tan(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two frames of 2x1 pixels.
+    fn answer(second: [f32; 9]) -> Answer {
+        let first = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 2.0, 1.0, 1.2];
+        Answer {
+            n_frames: 2,
+            width: 2,
+            height: 1,
+            pose_enc: [first, second].concat(),
+            depth: vec![1.0, 2.0, 3.0, 4.0],
+            depth_conf: vec![1.0, 2.0, 3.0, 5.0],
+        }
+    }
+
+    const SECOND: [f32; 9] = [2.0, 2.0, 3.0, 0.0, 0.0, 3.0, 3.0, 1.0, 1.2];
+
+    #[test]
+    fn poses_are_told_from_the_first_frame_either_way_round() {
+        // A quarter turn about z; the quaternion needs no unit length.
+        let cam_from_world = Rigid::new(
+            DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
+            DVec3::new(2.0, 2.0, 3.0),
+        );
+        let first = Rigid::new(DQuat::IDENTITY, DVec3::new(1.0, 2.0, 3.0));
+        let cases = [
+            (PoseKind::W2c, first * cam_from_world.inverse()),
+            (PoseKind::C2w, first.inverse() * cam_from_world),
+        ];
+        for (kind, expected) in cases {
+            let cameras = answer(SECOND).cameras(kind);
+            let pose = |i: usize| cameras[i].unwrap().window_from_cam;
+            assert_eq!(pose(0), Rigid::IDENTITY);
+            assert!(pose(1).translation.distance(expected.translation) < 1e-12);
+            assert!(pose(1).angle_to(&expected) < 1e-7);
+            let camera = cameras[1].unwrap();
+            assert!((camera.fy - 0.5 / 0.5f64.tan()).abs() < 1e-7);
+            assert!((camera.fx - 1.0 / 0.6f64.tan()).abs() < 1e-7);
+        }
+    }
+
+    #[test]
+    fn numbers_that_are_no_camera_are_named() {
+        for (at, value, expected) in [
+            (0, f32::NAN, Fault::PoseNotFinite),
+            (8, f32::INFINITY, Fault::PoseNotFinite),
+            (1, 1e20, Fault::TooFar),
+            (7, 0.0, Fault::FieldOfView),
+            (8, 3.1, Fault::FieldOfView),
+            (8, -1.0, Fault::FieldOfView),
+        ] {
+            let mut second = SECOND;
+            second[at] = value;
+            let cameras = answer(second).cameras(PoseKind::W2c);
+            assert_eq!(cameras[1], Err(expected));
+            assert!(cameras[0].is_ok());
+        }
+        let mut second = SECOND;
+        second[3..7].fill(0.0);
+        let cameras = answer(second).cameras(PoseKind::W2c);
+        assert_eq!(cameras[1], Err(Fault::QuaternionZero));
+    }
+
+    #[test]
+    fn depth_and_confidence_that_are_none_are_named() {
+        for (depth, confidence, expected) in [
+            (1.0, 1.0, None),
+            (0.0, 1.0, Some(Fault::Depth)),
+            (f32::NAN, 1.0, Some(Fault::Depth)),
+            (f32::INFINITY, 1.0, Some(Fault::Depth)),
+            (1e10, 1.0, Some(Fault::TooFar)),
+            (1.0, 0.5, Some(Fault::Confidence)),
+            (1.0, f32::NAN, Some(Fault::Confidence)),
+            (1.0, f32::INFINITY, Some(Fault::Confidence)),
+        ] {
+            let mut answer = answer(SECOND);
+            (answer.depth[3], answer.depth_conf[3]) = (depth, confidence);
+            assert_eq!((answer.fault_of(0), answer.fault_of(1)), (None, expected));
+        }
+    }
+
+    #[test]
+    fn trust_is_the_share_of_the_median() {
+        let answer = answer(SECOND);
+        assert_eq!(answer.median_confidence(&[0, 1]), 3.0);
+        let trusts = [1.0, 1.1, 2.0, 3.0, 50.0].map(|c| trust(c, 3.0));
+        assert_eq!(trusts, [0.0, 0.0, 0.5, 1.0, 1.0]);
+        assert_eq!(trust(1.0, 1.0), 1.0);
+    }
+
+    #[test]
+    fn depth_that_is_the_same_everywhere_is_flat() {
+        let mut answer = answer(SECOND);
+        assert!(!answer.is_flat(&[0, 1]) && !answer.is_flat(&[1]));
+        answer.depth = vec![2.0, 2.0, 2.0005, 2.0];
+        assert!(answer.is_flat(&[0, 1]) && answer.is_flat(&[]));
+    }
 }

@@ -156,3 +156,68 @@ impl Sidecar {
             .or(frames)
     }
 }
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    pub(crate) fn sidecar(width: u32, height: u32) -> Sidecar {
+        Sidecar {
+            family: Family::Mock,
+            height,
+            width,
+            patch: 14,
+            input_norm: InputNorm::Unit,
+            pose: PoseKind::W2c,
+            quat: QuaternionOrder::Xyzw,
+            ref_frame: RefFrame::First,
+            s_min: 1,
+            s_max: 8,
+            precision: Precision::F32,
+            licence: String::new(),
+            preprocess: Preprocess::Ratio,
+            heads: 0,
+        }
+    }
+
+    const WHOLE: &str = r#"{"contract":1,"family":"vggt","height":392,"width":518,"patch":14,"input_norm":"unit",
+        "pose":"w2c","quat":"xyzw","ref_frame":"first","s_min":1,"s_max":16,"precision":"f32","licence":"mine",
+        "exported_by":"somebody"}"#;
+
+    #[test]
+    fn a_description_is_read_with_its_defaults() {
+        let found = Sidecar::parse(WHOLE.as_bytes()).unwrap();
+        assert_eq!((found.height, found.s_max, found.heads), (392, 16, 0));
+        assert_eq!(
+            (found.preprocess, found.pose),
+            (Preprocess::Ratio, PoseKind::W2c)
+        );
+    }
+
+    #[test]
+    fn a_wrong_description_is_refused_with_what_is_wrong() {
+        for (from, to, word) in [
+            (
+                "\"contract\":1",
+                "\"contract\":2",
+                "contract is 2, expected 1",
+            ),
+            ("\"contract\":1,", "", "contract is null"),
+            ("\"height\":392", "\"height\":390", "height is 390"),
+            ("\"width\":518", "\"width\":51800", "width is 51800"),
+            ("\"patch\":14", "\"patch\":0", "patch 0"),
+            ("\"s_min\":1", "\"s_min\":17", "s_min is 17"),
+            ("\"s_min\":1", "\"s_min\":0", "s_min is 0"),
+            ("\"s_max\":16", "\"s_max\":1", "s_max 1"),
+            ("\"s_max\":16", "\"s_max\":1e9", "s_max"),
+            ("\"pose\":\"w2c\"", "\"pose\":\"c2c\"", "c2c"),
+            ("\"quat\":\"xyzw\"", "\"quat\":\"wxyz\"", "wxyz"),
+            ("\"family\":\"vggt\",", "", "family"),
+            ("{", "[", "expected"),
+        ] {
+            let text = WHOLE.replacen(from, to, 1);
+            let reason = Sidecar::parse(text.as_bytes()).unwrap_err();
+            assert!(reason.contains(word), "{to}: {reason}");
+        }
+    }
+}
