@@ -76,6 +76,17 @@ pub enum Preprocess {
     Pad,
 }
 
+/// How the layers that look at all frames are written down.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Attention {
+    /// In standard operators: every pair of tokens takes memory.
+    #[default]
+    Plain,
+    /// In one operator that needs no such matrix.
+    Fused,
+}
+
 /// What the JSON file says. Keys that are not here are no fault: later exports may say more.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Sidecar {
@@ -96,6 +107,8 @@ pub struct Sidecar {
     /// Attention heads of the layers that look at all frames; 0 where the file does not say.
     #[serde(default)]
     pub heads: u32,
+    #[serde(default)]
+    pub attention: Attention,
 }
 
 impl Sidecar {
@@ -177,6 +190,7 @@ pub(super) mod tests {
             licence: String::new(),
             preprocess: Preprocess::Ratio,
             heads: 0,
+            attention: Attention::Plain,
         }
     }
 

@@ -3,13 +3,14 @@
 use std::ops::Range;
 use std::path::Path;
 
-use crate::geometry::onnx::sidecar::{Family, Precision, Sidecar};
+use crate::geometry::onnx::sidecar::{Attention, Family, Precision, Sidecar};
 use crate::memory::{free_gpu_mib, free_mib};
 use crate::onnx::Provider;
 
 /// Share of the free memory that a window may take: the map grows meanwhile.
 const MEMORY_SHARE: f64 = 0.6;
 /// VGGT keeps 0.195 GB a frame in half precision, besides attention, at 1041 tokens a frame (its README, batch of 200).
+/// Narrower networks have fewer heads and keep as much less; DA3-SMALL was measured to.
 const BYTES_PER_TOKEN: f64 = 0.195e9 / 1041.0;
 /// Camera and register tokens of a frame, beside those of its patches.
 const EXTRA_TOKENS: f64 = 5.0;
@@ -36,8 +37,12 @@ pub fn bytes_of(sidecar: &Sidecar, n: usize) -> f64 {
         0 => USUAL_HEADS,
         heads => heads,
     };
-    let attention = 2.0 * number * f64::from(heads) * (n * tokens).powi(2);
-    in_and_out + n * tokens * BYTES_PER_TOKEN * number / 2.0 + attention
+    let attention = match sidecar.attention {
+        Attention::Plain => 2.0 * number * f64::from(heads) * (n * tokens).powi(2),
+        Attention::Fused => 0.0,
+    };
+    let width = f64::from(heads) / f64::from(USUAL_HEADS);
+    in_and_out + n * tokens * BYTES_PER_TOKEN * width * number / 2.0 + attention
 }
 
 /// Bytes that are free where the provider computes.
@@ -126,6 +131,11 @@ mod tests {
         let at = |gib: f64| size(&vggt, 0, Some(gib * 1024.0 * MIB));
         assert_eq!((at(0.0), at(200.0)), (2, 16));
         assert!((4..16).contains(&at(24.0)), "{}", at(24.0));
+        let fused = Sidecar {
+            attention: Attention::Fused,
+            ..vggt.clone()
+        };
+        assert_eq!(size(&fused, 0, Some(24.0 * 1024.0 * MIB)), 16);
         assert_eq!((size(&vggt, 5, Some(0.0)), size(&vggt, 99, None)), (5, 16));
         let fixed = Sidecar {
             s_min: 4,
