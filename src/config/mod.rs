@@ -4,6 +4,7 @@
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
 mod file;
+pub mod onnx;
 mod range;
 
 use std::collections::BTreeMap;
@@ -61,7 +62,7 @@ pub struct Params {
     pub known: KnownParams,
     pub sfm: SfmParams,
     pub mvs: MvsParams,
-    pub onnx: OnnxParams,
+    pub onnx: onnx::OnnxParams,
     pub map: MapParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
@@ -147,27 +148,6 @@ pub struct MvsParams {
     pub n_sources: usize,
     pub min_views: usize,
     pub backend: Backend,
-}
-
-/// Whose focal length counts where a frame has a calibration and a model predicts one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum IntrinsicsFrom {
-    Auto,
-    Model,
-    Camera,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct OnnxParams {
-    pub providers: String,
-    pub threads: usize,
-    pub window: usize,
-    pub window_overlap: usize,
-    pub intrinsics: IntrinsicsFrom,
-    pub rotation_error_deg: f64,
-    pub translation_error: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde_json::{Value, json};
-use splat_mapper::config::{OnnxParams, Settings};
+use splat_mapper::config::Settings;
+use splat_mapper::config::onnx::OnnxParams;
 use splat_mapper::frame::{DepthMap, Frame};
 use splat_mapper::geometry::onnx::model::Model;
 use splat_mapper::geometry::onnx::preprocess::Fit;

@@ -40,18 +40,16 @@ fn errors(output: &Output) -> String {
 fn replayed(library: &Path, geometry: &str, out: &Path) -> (Vec<TimedPose>, Value) {
     let out_dir = out.to_str().unwrap();
     let args = ["replay", DEMO, "--geometry", geometry, "--out", out_dir];
-    let more = [
-        "--backend",
-        "cpu",
-        "--steps",
-        "40",
-        "--max-side",
-        "640",
-        "--set",
+    let few = ["--backend", "cpu", "--steps", "10", "--holdout", "0"];
+    let settings = [
         "map.pose=held",
+        "map.max_side=160",
+        "map.seeds_per_keyframe=100",
+        "mvs.backend=cpu",
     ];
-    let small = ["--set", "map.max_side=160", "--set", "mvs.backend=cpu"];
-    let output = program(library, &[&args[..], &more, &small].concat());
+    let settings = settings.iter().flat_map(|s| ["--set", s]);
+    let more: Vec<&str> = few.into_iter().chain(settings).collect();
+    let output = program(library, &[&args[..], &more].concat());
     assert!(output.status.success(), "{}", errors(&output));
     let report = std::fs::read(out.join("report.json")).unwrap();
     let keyframes = read_tum(&out.join("keyframes.tum")).unwrap();

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::clock::Stopwatch;
-use crate::config::OnnxParams;
+use crate::config::onnx::OnnxParams;
 use crate::geometry::onnx::decode::Answer;
 use crate::geometry::onnx::model::Model;
 use crate::geometry::onnx::{ModelError, window};

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
-use crate::config::{IntrinsicsFrom, OnnxParams};
+use crate::config::onnx::{IntrinsicsFrom, OnnxParams};
 use crate::frame::{Batch, DepthMap, Keyframe};
 use crate::geometry::onnx::chain::Shared;
 use crate::geometry::onnx::decode::ModelCamera;

@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
-use crate::config::OnnxParams;
+use crate::config::onnx::OnnxParams;
 use crate::geometry::onnx::ModelError;
 use crate::geometry::onnx::contract::{INPUT, Places, places};
 use crate::geometry::onnx::decode::{Answer, POSE_LENGTH};
 use crate::geometry::onnx::sidecar::{InputNorm, Sidecar};
 use crate::onnx::{Network, NetworkOptions, Provider, Tensor, onnx_runtime};
 
-/// Networks of this kind gain little from more (ALGORITHM: intra-op threads).
+/// Cores that a network takes without being asked: the optimiser needs some, too.
 const MAX_THREADS: usize = 4;
 /// Frames that TensorRT tunes for.
 const USUAL_FRAMES: usize = 8;

@@ -223,7 +223,7 @@ pub(super) mod tests {
             ("\"s_min\":1", "\"s_min\":17", "s_min is 17"),
             ("\"s_min\":1", "\"s_min\":0", "s_min is 0"),
             ("\"s_max\":16", "\"s_max\":1", "s_max 1"),
-            ("\"s_max\":16", "\"s_max\":1e9", "s_max"),
+            ("\"s_max\":16", "\"s_max\":1025", "s_max 1025"),
             ("\"pose\":\"w2c\"", "\"pose\":\"c2c\"", "c2c"),
             ("\"quat\":\"xyzw\"", "\"quat\":\"wxyz\"", "wxyz"),
             ("\"family\":\"vggt\",", "", "family"),
