@@ -37,12 +37,30 @@ impl RgbImage {
     /// Low-passed to another size, which may change the aspect. Not `FilterType::Box`: at fractional scales it moves
     /// edges by a sixth of a pixel, Hamming by a fiftieth.
     pub fn resized(&self, width_px: u32, height_px: u32) -> Self {
-        use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer, images};
+        self.filtered(width_px, height_px, fast_image_resize::FilterType::Hamming)
+    }
+
+    /// The same by a cubic filter (a = -0.5), as networks have seen their pictures: sharper, and it overshoots at edges.
+    pub fn resized_cubic(&self, width_px: u32, height_px: u32) -> Self {
+        self.filtered(
+            width_px,
+            height_px,
+            fast_image_resize::FilterType::CatmullRom,
+        )
+    }
+
+    fn filtered(
+        &self,
+        width_px: u32,
+        height_px: u32,
+        filter: fast_image_resize::FilterType,
+    ) -> Self {
+        use fast_image_resize::{PixelType, ResizeAlg, ResizeOptions, Resizer, images};
         let source =
             images::ImageRef::new(self.width_px, self.height_px, &self.pixels, PixelType::U8x3)
                 .expect("three bytes per pixel");
         let mut target = images::Image::new(width_px, height_px, PixelType::U8x3);
-        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Hamming));
+        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(filter));
         Resizer::new()
             .resize(&source, &mut target, &options)
             .expect("both pictures are U8x3");

@@ -20,6 +20,8 @@ pub mod frame;
 
 pub mod libraries;
 
+pub mod memory;
+
 pub mod onnx;
 
 pub mod ros;

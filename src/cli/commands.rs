@@ -1,14 +1,18 @@
-//! `synth`, `eval`, `render`, `export`, `doctor`: arguments -> one call each.
+//! `synth`, `eval`, `render`, `export`, `model`, `doctor`: arguments -> one call each.
 
 use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 
-use crate::cli::{EvalArgs, ExportArgs, RenderArgs, SynthArgs, Usage, say};
+use crate::cli::{
+    EvalArgs, ExportArgs, ModelCheckArgs, RenderArgs, SynthArgs, Usage, mapping, say,
+};
 use crate::config::Backend;
 use crate::eval::{doctor as checks, evaluation, render, trajectory};
 use crate::export::ply;
+use crate::geometry::onnx::check::Report;
+use crate::geometry::onnx::model::Model;
 use crate::map::checkpoint;
 use crate::node;
 use crate::source::synthetic::SynthSettings;
@@ -98,6 +102,24 @@ pub(super) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
         ),
     }
     say(format!("{} splats: {}", splats.len(), args.out.display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+pub(super) fn model_check(args: &ModelCheckArgs) -> anyhow::Result<ExitCode> {
+    let params = mapping::settings(&args.params)?.params()?.onnx;
+    let report = Report::of(Model::open(&args.file, &params)?, &params)?;
+    if args.json {
+        say(serde_json::to_string_pretty(&report)?);
+    } else {
+        say(&report);
+    }
+    if let Some(fault) = report.faults.first() {
+        bail!(
+            "the model's answers cannot be used, {} faults: {fault}: {}",
+            report.faults.len(),
+            args.file.display()
+        );
+    }
     Ok(ExitCode::SUCCESS)
 }
 

@@ -56,7 +56,7 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     map(&settings, &args.input, args.out.as_deref())
 }
 
-fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
+pub(super) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
     let mut settings = Settings::shipped();
     if let Some(preset) = &args.preset {
         settings.merge_preset(preset).map_err(|e| usage(&e))?;

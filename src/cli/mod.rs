@@ -31,6 +31,9 @@ enum Command {
     Render(RenderArgs),
     /// Converts a map to another format
     Export(ExportArgs),
+    /// Looks at models for --geometry onnx:FILE
+    #[command(subcommand)]
+    Model(ModelCommand),
     /// Says what is missing on this machine, and the line that fixes it
     Doctor,
 }
@@ -75,7 +78,7 @@ struct ReplayArgs {
     /// auto, wgpu or cpu
     #[arg(long)]
     backend: Option<String>,
-    /// sfm or known
+    /// sfm, known or onnx:FILE
     #[arg(long)]
     geometry: Option<String>,
     /// Optimiser updates of the whole run
@@ -163,6 +166,24 @@ struct ExportArgs {
     out: PathBuf,
 }
 
+#[derive(Debug, Subcommand)]
+enum ModelCommand {
+    /// Checks a model against the contract of docs/MODELS.md, and times windows of 1, 2, 4 ... frames
+    Check(ModelCheckArgs),
+}
+
+#[derive(Debug, Args)]
+struct ModelCheckArgs {
+    /// ONNX file; its description lies beside it as .json
+    #[arg(value_name = "FILE.onnx")]
+    file: PathBuf,
+    /// Prints JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
 /// Runs the program: exit 0 done, 1 failed with one line that says why, 2 usage.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
@@ -173,6 +194,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => commands::eval(&args),
         Command::Render(args) => commands::render(&args),
         Command::Export(args) => commands::export(&args),
+        Command::Model(ModelCommand::Check(args)) => commands::model_check(&args),
         Command::Doctor => Ok(commands::doctor()),
     };
     match result {

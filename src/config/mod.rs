@@ -4,6 +4,7 @@
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
 mod file;
+pub mod onnx;
 mod range;
 
 use std::collections::BTreeMap;
@@ -62,6 +63,7 @@ pub struct Params {
     pub sfm: SfmParams,
     pub mvs: MvsParams,
     pub align: AlignParams,
+    pub onnx: onnx::OnnxParams,
     pub map: MapParams,
     pub eval: EvalParams,
     pub publish: PublishParams,

@@ -5,9 +5,10 @@
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use super::machine::{cpu_features, free_disk_mib, free_memory_mib, icd_files};
+use super::machine::{cpu_features, free_disk_mib, icd_files};
 use crate::libraries::{entries, find_library, library_folders};
-use crate::onnx::ONNX_RUNTIME_FIX;
+use crate::memory::free_mib;
+use crate::onnx::{ONNX_RUNTIME_FIX, Provider};
 
 /// A run over some hundred keyframes stays below this.
 const NEEDED_MEMORY_MIB: f64 = 2048.0;
@@ -69,7 +70,7 @@ pub fn doctor() -> Vec<Check> {
     let named_onnx_runtime = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
     vec![
         cpu(),
-        memory(free_memory_mib()),
+        memory(free_mib()),
         write_access(here),
         disk(free_disk_mib()),
         vulkan_loader(&library_folders()),
@@ -269,25 +270,37 @@ fn cameras(dev: &Path) -> Check {
 }
 
 fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
-    if let Some(path) = named {
-        return if path.is_file() {
-            Check::ok("onnx runtime", path.display().to_string())
-        } else {
-            Check::optional(
+    let is_named = named.is_some();
+    match named.or_else(|| find_library(folders, "libonnxruntime.so")) {
+        Some(path) if path.is_file() => {
+            let providers = providers_beside(&path).join(", ");
+            Check::ok(
                 "onnx runtime",
-                format!("ORT_DYLIB_PATH names no file: {}", path.display()),
-                ONNX_RUNTIME_FIX,
+                format!("{}, for {providers}", path.display()),
             )
-        };
-    }
-    match find_library(folders, "libonnxruntime.so") {
-        Some(path) => Check::ok("onnx runtime", path.display().to_string()),
-        None => Check::optional(
+        }
+        Some(path) if is_named => Check::optional(
             "onnx runtime",
-            "none; only eval.lpips_model and sfm.features=xfeat need it (and onnx:FILE geometry in a later version)",
+            format!("ORT_DYLIB_PATH names no file: {}", path.display()),
+            ONNX_RUNTIME_FIX,
+        ),
+        _ => Check::optional(
+            "onnx runtime",
+            "none; only --geometry onnx:FILE, eval.lpips_model and sfm.features=xfeat need it",
             ONNX_RUNTIME_FIX,
         ),
     }
+}
+
+/// What the library can compute on: each provider but the CPU is a library of its own beside it.
+fn providers_beside(library: &Path) -> Vec<&'static str> {
+    let folder = library.parent().unwrap_or(Path::new("."));
+    let has = |name: &str| find_library(&[folder.to_owned()], name).is_some();
+    Provider::ALL
+        .into_iter()
+        .map(Provider::name)
+        .filter(|name| *name == "cpu" || has(&format!("libonnxruntime_providers_{name}.so")))
+        .collect()
 }
 
 /// Joins zenoh's scouting group and leaves it again; nothing is sent.

@@ -5,7 +5,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::frame::RgbImage;
-use crate::onnx::{Network, OnnxError, Tensor, network};
+use crate::onnx::{Network, NetworkOptions, OnnxError, Tensor, network};
 
 #[derive(Debug, thiserror::Error)]
 pub enum LpipsError {
@@ -34,7 +34,7 @@ pub struct Lpips {
 impl Lpips {
     /// `library`: see `onnx::onnx_runtime`.
     pub fn open(library: &Path, model: &Path) -> Result<Self, LpipsError> {
-        Self::of(Network::open(library, model)?)
+        Self::of(Network::open(library, model, &NetworkOptions::default())?)
     }
 
     fn of(network: Network) -> Result<Self, LpipsError> {
@@ -85,5 +85,5 @@ pub fn lpips(model: &str) -> Result<Option<Lpips>, LpipsError> {
     if model.is_empty() {
         return Ok(None);
     }
-    Lpips::of(network(Path::new(model))?).map(Some)
+    Lpips::of(network(Path::new(model), &NetworkOptions::default())?).map(Some)
 }

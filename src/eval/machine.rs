@@ -49,16 +49,6 @@ pub fn icd_files() -> Vec<PathBuf> {
         .collect()
 }
 
-/// Of the machine, or of the container where that has less.
-pub fn free_memory_mib() -> Option<f64> {
-    let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
-    free_memory_of(
-        &read("/proc/meminfo"),
-        &read("/sys/fs/cgroup/memory.max"),
-        &read("/sys/fs/cgroup/memory.current"),
-    )
-}
-
 /// In the current folder, as `df` says: the standard library does not know.
 pub fn free_disk_mib() -> Option<f64> {
     let output = std::process::Command::new("df")
@@ -66,19 +56,6 @@ pub fn free_disk_mib() -> Option<f64> {
         .output()
         .ok()?;
     free_disk_of(&String::from_utf8_lossy(&output.stdout))
-}
-
-fn free_memory_of(meminfo: &str, cgroup_max: &str, cgroup_used: &str) -> Option<f64> {
-    let line = meminfo
-        .lines()
-        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
-    let available_kib: f64 = line.split_ascii_whitespace().next()?.parse().ok()?;
-    // The file holds `max` where the container has no limit.
-    let bytes = |text: &str| text.trim().parse::<f64>().ok();
-    let in_container_kib = bytes(cgroup_max)
-        .zip(bytes(cgroup_used))
-        .map(|(max, used)| (max - used).max(0.0) / 1024.0);
-    Some(in_container_kib.map_or(available_kib, |limit| limit.min(available_kib)) / 1024.0)
 }
 
 /// Last line of `df -Pk`: device, size, used, available in KiB.
@@ -96,19 +73,6 @@ fn free_disk_of(df: &str) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn memory_is_that_of_the_container_when_less() {
-        let meminfo = "MemTotal:  16000000 kB\nMemAvailable:  8388608 kB\n";
-        assert_eq!(free_memory_of(meminfo, "max\n", "5"), Some(8192.0));
-        assert_eq!(free_memory_of(meminfo, "4294967296\n", "0\n"), Some(4096.0));
-        assert_eq!(
-            free_memory_of(meminfo, "1073741824", "536870912"),
-            Some(512.0)
-        );
-        assert_eq!(free_memory_of(meminfo, "5", "7"), Some(0.0));
-        assert_eq!(free_memory_of("", "", ""), None);
-    }
 
     #[test]
     fn disk_space_is_the_fourth_column() {

@@ -191,11 +191,6 @@ pub fn percentile(values: &[f64], share: f64) -> Option<f64> {
     Some(below + (above - below) * place.fract())
 }
 
-/// The most memory this process ever had, where the system tells (Linux).
-pub fn peak_rss_mib() -> Option<f64> {
-    peak_of_status(&std::fs::read_to_string("/proc/self/status").ok()?)
-}
-
 /// SHA-256 in hexadecimal.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     use sha2::Digest;
@@ -204,14 +199,6 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
         .iter()
         .map(|byte| format!("{byte:02x}"))
         .collect()
-}
-
-fn peak_of_status(status: &str) -> Option<f64> {
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("VmHWM:"))?;
-    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    Some(kib / 1024.0)
 }
 
 /// JSON has no NaN: it is written as null, and so must be read back.
@@ -236,16 +223,6 @@ mod tests {
             (percentile(&[], 0.5), percentile(&[7.0], 0.95)),
             (None, Some(7.0))
         );
-    }
-
-    #[test]
-    fn peak_memory_is_read_from_the_status_file() {
-        assert_eq!(
-            peak_of_status("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 1 kB\n"),
-            Some(2.0)
-        );
-        assert_eq!(peak_of_status("Name:\tx\n"), None);
-        assert_eq!(peak_of_status("VmHWM:\t many kB\n"), None);
     }
 
     #[test]

@@ -7,6 +7,7 @@ pub mod focal;
 pub mod known;
 pub mod matching;
 pub mod mvs;
+pub mod onnx;
 pub mod pnp;
 pub mod scale_space;
 pub mod sfm;
@@ -132,10 +133,12 @@ pub enum GeometryError {
         "mvs.backend is wgpu, so that depth is matched on a GPU, and none will do; mvs.backend=cpu needs none: {0}"
     )]
     NoGpu(#[from] GpuError),
-    #[error("{name:?} is no geometry; expected sfm or known")]
+    #[error("{name:?} is no geometry; expected sfm, known or onnx:FILE")]
     UnknownModel { name: String },
     #[error(transparent)]
     Features(#[from] features::FeaturesError),
+    #[error(transparent)]
+    Model(#[from] onnx::ModelError),
 }
 
 /// Estimates cameras and depth. One thread owns it; calls come in order of batches.

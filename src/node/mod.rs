@@ -6,6 +6,7 @@ pub mod pipeline;
 pub mod run_dir;
 mod stages;
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -16,6 +17,7 @@ use crate::clock::{Stamp, Stopwatch};
 use crate::config::{Backend, Params, PublishParams};
 use crate::geometry::GeometryModel;
 use crate::geometry::known::Known;
+use crate::geometry::onnx::Foundation;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
@@ -141,10 +143,13 @@ fn model(
             let known = known.in_windows(&params.align, &params.sfm)?;
             Ok((Box::new(known), scale))
         }
-        name if name.starts_with("onnx:") => {
-            bail!("this build has no ONNX Runtime; use --geometry sfm: {name}")
-        }
-        name => bail!("{name:?} is no geometry; expected sfm or known"),
+        name => match name.strip_prefix("onnx:") {
+            Some(file) => Ok((
+                Box::new(Foundation::open(Path::new(file), &params.onnx)?),
+                ScaleSource::UpToScale,
+            )),
+            None => bail!("{name:?} is no geometry; expected sfm, known or onnx:FILE"),
+        },
     }
 }
 

@@ -20,15 +20,14 @@ use crate::eval::health::write_health;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
-use crate::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing, peak_rss_mib,
-};
+use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing};
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
 use crate::frame::RgbImage;
 use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::layout::map_sha256;
 use crate::map::snapshot::Snapshot;
+use crate::memory::peak_rss_mib;
 use crate::node::Outcome;
 use crate::splat::Rendering;
 

@@ -6,82 +6,12 @@ use std::process::{Command, Output};
 use splat_mapper::eval::lpips::Lpips;
 use splat_mapper::frame::RgbImage;
 
+use crate::graphs::{self, INPUT, OUTPUT, int, library, node, tensor};
+
 const ROOM: &str = "synthetic:room?frames=12&width=96&height=72&speed=3";
-/// ONNX: type number of f32 tensors, and of integer attributes.
-const FLOAT: u64 = 1;
-const INT: u64 = 2;
-
-/// The library that scripts/setup test put into target/onnxruntime, or the one that is named. Without it: fails under
-/// CI=true, else says so, and the test returns.
-pub(crate) fn library() -> Option<PathBuf> {
-    let named = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
-    let folder = Path::new("target/onnxruntime/onnxruntime/capi");
-    let is_library = |path: &PathBuf| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        name.starts_with("libonnxruntime.so")
-    };
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let installed = entries.map(|entry| entry.path()).find(is_library);
-    let found = named
-        .or(installed)
-        .and_then(|path| path.canonicalize().ok());
-    if found.is_none() {
-        let reason = "no ONNX Runtime in target/onnxruntime; run scripts/setup test";
-        assert!(std::env::var("CI").as_deref() != Ok("true"), "{reason}");
-        eprintln!("ignored: {reason}");
-    }
-    found
-}
-
-/// Protobuf: a number, and bytes, under a field.
-fn number(field: u64, value: u64) -> Vec<u8> {
-    [varint(field << 3), varint(value)].concat()
-}
-
-fn bytes(field: u64, content: &[u8]) -> Vec<u8> {
-    [
-        &varint(field << 3 | 2),
-        &varint(content.len() as u64),
-        content,
-    ]
-    .concat()
-}
-
-fn varint(mut value: u64) -> Vec<u8> {
-    let mut out = Vec::new();
-    while value >= 128 {
-        out.push((value % 128) as u8 | 128);
-        value /= 128;
-    }
-    out.push(value as u8);
-    out
-}
-
-fn node(op: &str, inputs: &[&str], output: &str, attributes: &[u8]) -> Vec<u8> {
-    let mut content: Vec<u8> = inputs.iter().flat_map(|i| bytes(1, i.as_bytes())).collect();
-    content.extend(bytes(2, output.as_bytes()));
-    content.extend(bytes(4, op.as_bytes()));
-    content.extend(attributes);
-    bytes(1, &content)
-}
-
-/// A named f32 tensor; sides that are words are free.
-fn tensor(field: u64, name: &str, sides: &[&str]) -> Vec<u8> {
-    let side = |side: &&str| match side.parse() {
-        Ok(n) => bytes(1, &number(1, n)),
-        Err(_) => bytes(1, &bytes(2, side.as_bytes())),
-    };
-    let shape: Vec<u8> = sides.iter().flat_map(side).collect();
-    let of_type = bytes(1, &[number(1, FLOAT), bytes(2, &shape)].concat());
-    bytes(
-        field,
-        &[bytes(1, name.as_bytes()), bytes(2, &of_type)].concat(),
-    )
-}
 
 /// Mean of |a - b| over `inputs` pictures named a, b, ...: with one input, of |a|.
 pub(crate) fn network(inputs: &[&str]) -> Vec<u8> {
-    let keep_no_sides = [bytes(1, b"keepdims"), number(3, 0), number(20, INT)].concat();
     let mut graph = match inputs {
         [one] => node("Abs", &[one], "size", &[]),
         _ => [
@@ -90,19 +20,12 @@ pub(crate) fn network(inputs: &[&str]) -> Vec<u8> {
         ]
         .concat(),
     };
-    graph.extend(node(
-        "ReduceMean",
-        &["size"],
-        "mean",
-        &bytes(5, &keep_no_sides),
-    ));
-    graph.extend(bytes(2, b"mean_difference"));
+    graph.extend(node("ReduceMean", &["size"], "mean", &int("keepdims", 0)));
     for name in inputs {
-        graph.extend(tensor(11, name, &["1", "3", "H", "W"]));
+        graph.extend(tensor(INPUT, name, &["1", "3", "H", "W"]));
     }
-    graph.extend(tensor(12, "mean", &[]));
-    let opset = [bytes(1, b""), number(2, 13)].concat();
-    [number(1, 8), bytes(7, &graph), bytes(8, &opset)].concat()
+    graph.extend(tensor(OUTPUT, "mean", &[]));
+    graphs::model(&[graph])
 }
 
 pub(crate) fn saved(folder: &Path, content: &[u8]) -> PathBuf {

@@ -10,7 +10,7 @@ use glam::DVec2;
 
 use super::{Descriptors, Features, FeaturesError, XFEAT_LENGTH, resized};
 use crate::geometry::scale_space::Grey;
-use crate::onnx::{Network, OnnxError, Tensor, network};
+use crate::onnx::{Network, NetworkOptions, OnnxError, Tensor, network};
 
 const WIDTH: usize = 640;
 const HEIGHT: usize = 480;
@@ -52,12 +52,13 @@ pub struct Raw {
 
 impl Xfeat {
     pub fn open(model: &Path) -> Result<Self, FeaturesError> {
-        Self::of(network(model).map_err(refused)?)
+        Self::of(network(model, &NetworkOptions::default()).map_err(refused)?)
     }
 
     /// `library`: see `onnx::onnx_runtime`.
     pub fn open_by(library: &Path, model: &Path) -> Result<Self, FeaturesError> {
-        Self::of(Network::open(library, model).map_err(refused)?)
+        let network = Network::open(library, model, &NetworkOptions::default());
+        Self::of(network.map_err(refused)?)
     }
 
     fn of(network: Network) -> Result<Self, FeaturesError> {
@@ -66,7 +67,7 @@ impl Xfeat {
             path: network.path().to_owned(),
         };
         let inputs = network.inputs();
-        let shapes: Vec<&Vec<i64>> = inputs.iter().map(|(_, shape)| shape).collect();
+        let shapes: Vec<&Vec<i64>> = inputs.iter().map(|port| &port.shape).collect();
         if shapes != [&INPUT.to_vec()] {
             return Err(fail(format!(
                 "inputs {shapes:?}, expected one of {INPUT:?}"
@@ -77,8 +78,11 @@ impl Xfeat {
         for (place, (name, shape)) in order.iter_mut().zip(OUTPUTS) {
             *place = outputs
                 .iter()
-                .position(|(n, s)| n == name && s[..] == shape)
-                .ok_or_else(|| fail(format!("outputs {outputs:?}, expected {name:?} {shape:?}")))?;
+                .position(|port| port.name == name && port.shape[..] == shape)
+                .ok_or_else(|| {
+                    let found: Vec<String> = outputs.iter().map(ToString::to_string).collect();
+                    fail(format!("outputs {found:?}, expected {name:?} {shape:?}"))
+                })?;
         }
         Ok(Self {
             network: Mutex::new(network),
