@@ -3,6 +3,7 @@
 //! The embedded file is the only home of defaults and ranges: the structs below have neither. A user's file or
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
+pub mod align;
 mod file;
 pub mod onnx;
 mod range;
@@ -13,6 +14,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
 use crate::config::range::{Range, ranges_of_comments};
 
@@ -160,38 +162,6 @@ pub struct MvsParams {
     pub n_sources: usize,
     pub min_views: usize,
     pub backend: Backend,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum AlignMethod {
-    Off,
-    Epipolar,
-    Bundle,
-    Both,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum JoinBy {
-    Points,
-    Poses,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct AlignParams {
-    pub method: AlignMethod,
-    pub steps: usize,
-    pub max_pair_deg: f64,
-    pub max_matches: usize,
-    pub principal_point: bool,
-    pub depth_error: f64,
-    pub join: JoinBy,
-    pub history: usize,
-    pub min_inliers: f64,
-    pub max_scale_jump: f64,
-    pub max_turn_deg: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

@@ -12,7 +12,8 @@ use glam::DVec3;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
-use crate::config::{AlignParams, KnownParams, MvsParams, SfmParams};
+use crate::config::align::AlignParams;
+use crate::config::{KnownParams, MvsParams, SfmParams};
 use crate::frame::{Batch, DepthMap, Keyframe};
 use crate::geometry::align::Aligner;
 use crate::geometry::align::noise::{Noise, answer, normal, normal3};
@@ -246,6 +247,7 @@ fn exact_views(batch: &Batch) -> Result<Vec<View>, GeometryError> {
                 keyframe_id: keyframe.id,
                 component: 0,
                 intrinsics: keyframe.frame.intrinsics.ok_or_else(|| no_lens(keyframe))?,
+                lens: None,
                 batch_from_cam: truth_of(keyframe)?,
                 depth,
                 health: Health::default(),

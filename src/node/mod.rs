@@ -16,8 +16,10 @@ use anyhow::{Context, bail};
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{Backend, Params, PublishParams};
 use crate::geometry::GeometryModel;
+use crate::geometry::align::Aligner;
 use crate::geometry::known::Known;
 use crate::geometry::onnx::Foundation;
+use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
@@ -144,10 +146,12 @@ fn model(
             Ok((Box::new(known), scale))
         }
         name => match name.strip_prefix("onnx:") {
-            Some(file) => Ok((
-                Box::new(Foundation::open(Path::new(file), &params.onnx)?),
-                ScaleSource::UpToScale,
-            )),
+            Some(file) => {
+                let network = Model::open(Path::new(file), &params.onnx)?;
+                let aligner = Aligner::new(&params.align, &params.sfm, params.seed)?;
+                let foundation = Foundation::of(network, &params.onnx, aligner);
+                Ok((Box::new(foundation), ScaleSource::UpToScale))
+            }
             None => bail!("{name:?} is no geometry; expected sfm, known or onnx:FILE"),
         },
     }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use splat_mapper::camera::Intrinsics;
 use splat_mapper::clock::Stopwatch;
-use splat_mapper::config::{AlignMethod, AlignParams, JoinBy, Params, Settings};
+use splat_mapper::config::align::{AlignMethod, AlignParams, JoinBy};
+use splat_mapper::config::{Params, Settings};
 use splat_mapper::eval::align::align;
 use splat_mapper::eval::evaluation::compare;
 use splat_mapper::eval::trajectory::read_tum;
@@ -62,6 +63,7 @@ fn film(kind: SceneKind, frames: impl Iterator<Item = u32>) -> Filmed {
             keyframe_id,
             component: 0,
             intrinsics: lens,
+            lens: None,
             batch_from_cam: take.pose(ix),
             depth: take.depth(ix, &lens.resized(160, 120)),
             health: Health::default(),

@@ -289,7 +289,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
 fn foundation(library: &Path, broken: &Computing) -> Foundation {
     let folder = tempfile::tempdir().unwrap();
     let path = saved(folder.path(), &broken.bytes(), &description(42, 28, 14));
-    Foundation::of(open(library, &path).unwrap(), &params(&[]))
+    crate::onnx_models::foundation(open(library, &path).unwrap(), &[])
 }
 
 fn assert_finite(geometry: &GeometryBatch) {

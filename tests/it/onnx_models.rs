@@ -8,6 +8,8 @@ use serde_json::{Value, json};
 use splat_mapper::config::Settings;
 use splat_mapper::config::onnx::OnnxParams;
 use splat_mapper::frame::{DepthMap, Frame};
+use splat_mapper::geometry::align::Aligner;
+use splat_mapper::geometry::onnx::Foundation;
 use splat_mapper::geometry::onnx::model::Model;
 use splat_mapper::geometry::onnx::preprocess::Fit;
 use splat_mapper::pose::Rigid;
@@ -134,6 +136,15 @@ pub fn params(settings: &[&str]) -> OnnxParams {
     let mut all = Settings::shipped();
     settings.iter().for_each(|s| all.merge_setting(s).unwrap());
     all.params().unwrap().onnx
+}
+
+/// The model with the shipped parameters after these settings.
+pub fn foundation(model: Model, settings: &[&str]) -> Foundation {
+    let mut all = Settings::shipped();
+    settings.iter().for_each(|s| all.merge_setting(s).unwrap());
+    let params = all.params().unwrap();
+    let aligner = Aligner::new(&params.align, &params.sfm, params.seed).unwrap();
+    Foundation::of(model, &params.onnx, aligner)
 }
 
 pub fn open(library: &Path, path: &Path) -> Result<Model, String> {

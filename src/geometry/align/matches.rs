@@ -9,7 +9,8 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{Matched, Pair, Shot};
-use crate::config::{AlignParams, SfmParams};
+use crate::config::SfmParams;
+use crate::config::align::AlignParams;
 use crate::frame::RgbImage;
 use crate::geometry::View;
 use crate::geometry::features::{Features, FeaturesError, Finder, working_picture, working_size};

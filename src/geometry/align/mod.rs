@@ -26,7 +26,8 @@ use self::matches::Matcher;
 use self::tracks::{points, tracks};
 use self::window::{Joined, Windows};
 use crate::camera::Intrinsics;
-use crate::config::{AlignMethod, AlignParams, SfmParams};
+use crate::config::SfmParams;
+use crate::config::align::{AlignMethod, AlignParams};
 use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::View;
 use crate::geometry::features::FeaturesError;
@@ -120,6 +121,10 @@ impl Aligner {
         };
         let refined = self.refine(&mut window, pictures, given);
         let mut joined = self.windows.join(window);
+        if self.params.method == AlignMethod::Off {
+            joined.note = joined.note.or(lost);
+            return joined;
+        }
         let mut views = self.windows.before(&joined, self.params.history);
         let n_held = views.len();
         let fresh = joined.views.iter().filter(|view| joined.is_new(view));

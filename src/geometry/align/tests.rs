@@ -176,6 +176,7 @@ fn wall(id: u32, pose: Rigid) -> View {
         keyframe_id: id,
         component: 0,
         intrinsics: LENS,
+        lens: None,
         batch_from_cam: pose,
         depth: DepthMap {
             width_px,
@@ -211,7 +212,10 @@ fn moved(views: &[View], scale: f64) -> Vec<View> {
 
 #[test]
 fn windows_that_fit_share_one_frame_by_points_and_by_poses() {
-    for join in [crate::config::JoinBy::Points, crate::config::JoinBy::Poses] {
+    for join in [
+        crate::config::align::JoinBy::Points,
+        crate::config::align::JoinBy::Poses,
+    ] {
         let mut windows = Windows::new(&AlignParams {
             join,
             ..params().align

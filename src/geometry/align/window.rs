@@ -9,7 +9,7 @@ use glam::DVec3;
 
 use super::Refined;
 use super::overlap::{Shared, by_points, by_poses, inlier_share};
-use crate::config::{AlignParams, JoinBy};
+use crate::config::align::{AlignParams, JoinBy};
 use crate::geometry::View;
 use crate::pose::{Rigid, Similarity};
 

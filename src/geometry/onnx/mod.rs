@@ -4,7 +4,6 @@
 //! A model answers for one window of frames, in the frame and scale of that window; windows are joined by the frames
 //! that they share. What fails is dropped and counted, and no number that is none gets out.
 
-pub mod chain;
 pub mod check;
 pub mod contract;
 pub mod decode;
@@ -15,25 +14,23 @@ pub mod sidecar;
 pub mod window;
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::camera::Intrinsics;
 use crate::config::onnx::{IntrinsicsFrom, OnnxParams};
 use crate::frame::{Batch, DepthMap, Keyframe};
-use crate::geometry::onnx::chain::Shared;
+use crate::geometry::align::Aligner;
 use crate::geometry::onnx::decode::ModelCamera;
 use crate::geometry::onnx::losses::Losses;
 use crate::geometry::onnx::model::Model;
 use crate::geometry::onnx::preprocess::Fit;
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, Health, PoseError, View};
 use crate::onnx::OnnxError;
-use crate::pose::{Rigid, Similarity};
+use crate::pose::Rigid;
 
 /// One frame alone has no place.
 const MIN_FRAMES: usize = 2;
-/// Scales of neighbouring windows differ by less, if they show the same scene.
-const MAX_SCALE_STEP: f64 = 3.0;
 
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
@@ -63,20 +60,9 @@ pub struct Foundation {
     /// Frames of one window.
     window: usize,
     /// Keyframes that have a place, of the newest batch that had any: the next batch shares some of them.
-    placed: BTreeMap<u32, Placed>,
-    /// Components that windows without a link have begun.
-    n_components: u32,
-    /// Scale of the newest window that was joined.
-    last_scale: Option<f64>,
+    placed: BTreeMap<u32, Arc<Keyframe>>,
+    aligner: Aligner,
     losses: Losses,
-}
-
-#[derive(Debug)]
-struct Placed {
-    keyframe: Arc<Keyframe>,
-    component: u32,
-    component_from_cam: Rigid,
-    depth: DepthMap,
 }
 
 /// A frame that the network placed in its window.
@@ -88,12 +74,24 @@ struct Seen {
     depth: DepthMap,
 }
 
-impl Foundation {
-    pub fn open(model: &Path, params: &OnnxParams) -> Result<Self, ModelError> {
-        Ok(Self::of(Model::open(model, params)?, params))
+impl Seen {
+    /// In the frame of its window.
+    fn view(self) -> View {
+        View {
+            keyframe_id: self.keyframe.id,
+            component: 0,
+            intrinsics: self.intrinsics,
+            lens: None,
+            batch_from_cam: self.window_from_cam,
+            depth: self.depth,
+            health: Health::default(),
+        }
     }
+}
 
-    pub fn of(model: Model, params: &OnnxParams) -> Self {
+impl Foundation {
+    /// `aligner` corrects the windows and lays them into one frame.
+    pub fn of(model: Model, params: &OnnxParams, aligner: Aligner) -> Self {
         let provider = model.provider();
         let weights = window::weight_bytes(model.path()) as f64;
         let free = window::free_bytes(provider).map(|free| (free - weights).max(0.0));
@@ -112,8 +110,7 @@ impl Foundation {
             params: params.clone(),
             window,
             placed: BTreeMap::new(),
-            n_components: 0,
-            last_scale: None,
+            aligner,
             losses: Losses::default(),
         }
     }
@@ -202,82 +199,35 @@ impl Foundation {
         if window.is_empty() {
             return Vec::new();
         }
-        let (component, component_from_window) = self.link(&window).unwrap_or_else(|| {
-            self.n_components += 1;
-            (self.n_components - 1, Similarity::IDENTITY)
+        let is_calibrated = window.iter().all(|seen| {
+            self.params.intrinsics != IntrinsicsFrom::Model
+                && seen.keyframe.frame.intrinsics.is_some()
         });
-        let mut views = Vec::new();
-        for seen in window {
-            let id = seen.keyframe.id;
-            let is_placed = self.placed.get(&id);
-            if is_placed.is_some_and(|placed| placed.component == component) {
-                continue;
-            }
-            let mut depth = seen.depth;
-            for value in &mut depth.depth {
-                *value = (f64::from(*value) * component_from_window.scale) as f32;
-            }
-            let component_from_cam = component_from_window.transform_pose(&seen.window_from_cam);
-            let is_new = is_placed.is_none();
-            let placed = Placed {
-                keyframe: seen.keyframe,
-                component,
-                component_from_cam,
-                depth: depth.clone(),
-            };
-            // A frame that an older component has is kept there, and links what comes to the newer one.
-            self.placed.insert(id, placed);
-            if is_new {
-                views.push(View {
-                    keyframe_id: id,
-                    component,
-                    intrinsics: seen.intrinsics,
-                    batch_from_cam: component_from_cam,
-                    depth,
-                    health: Health::default(),
-                });
-            }
-        }
-        views
-    }
-
-    /// The newest component that the window shares frames with, and the way there; `None` where there is none, or none
-    /// to trust.
-    fn link(&mut self, window: &[Seen]) -> Option<(u32, Similarity)> {
-        let both = window
-            .iter()
-            .filter_map(|seen| Some((seen, self.placed.get(&seen.keyframe.id)?)));
-        let both: Vec<(&Seen, &Placed)> = both.collect();
-        let component = both.iter().map(|(_, placed)| placed.component).max()?;
-        let of_component = both
-            .iter()
-            .filter(|(_, placed)| placed.component == component);
-        let shared: Vec<Shared<'_>> = of_component
-            .map(|(seen, placed)| Shared {
-                map_from_cam: placed.component_from_cam,
-                depth_in_map: &placed.depth,
-                window_from_cam: seen.window_from_cam,
-                depth_in_window: &seen.depth,
-            })
+        let keyframes: Vec<Arc<Keyframe>> = window.iter().map(|s| s.keyframe.clone()).collect();
+        let pictures = keyframes.iter();
+        let pictures = pictures
+            .map(|k| (k.id, Arc::clone(&k.frame.image)))
             .collect();
-        let found = chain::similarity(&shared).and_then(|similarity| {
-            let step = self.last_scale.map_or(1.0, |last| similarity.scale / last);
-            let is_near = (1.0 / MAX_SCALE_STEP..=MAX_SCALE_STEP).contains(&step);
-            is_near.then_some(similarity).ok_or_else(|| {
-                format!("scale jumps by a factor of {step:.2}, more than {MAX_SCALE_STEP}")
-            })
-        });
-        match found {
-            Ok(similarity) => {
-                self.last_scale = Some(similarity.scale);
-                Some((component, similarity))
-            }
-            Err(reason) => {
-                self.last_scale = None;
-                self.losses.lose_link(reason);
-                None
+        let views = window.into_iter().map(Seen::view).collect();
+        let mut joined = self.aligner.place(views, &pictures, is_calibrated);
+        tracing::debug!(fit = ?joined.fit, refined = ?joined.refined, "window");
+        if joined.fit.is_none() && !self.placed.is_empty() {
+            self.losses
+                .lose_link(joined.note.take().unwrap_or_default());
+        }
+        let views = std::mem::take(&mut joined.views);
+        let (mut fresh, mut again) = (Vec::new(), Vec::new());
+        for view in views {
+            let is_placed = self.placed.contains_key(&view.keyframe_id);
+            if is_placed { &mut again } else { &mut fresh }.push(view);
+        }
+        for view in fresh.iter().chain(&again) {
+            let keyframe = keyframes.iter().find(|k| k.id == view.keyframe_id);
+            if let Some(keyframe) = keyframe {
+                self.placed.insert(view.keyframe_id, Arc::clone(keyframe));
             }
         }
+        fresh
     }
 
     /// The batch, behind some placed keyframes where it shares none itself: its neighbour was dropped.
@@ -292,7 +242,7 @@ impl Foundation {
             self.params.window_overlap
         };
         let newest = self.placed.values().rev().take(n_anchors);
-        let mut keyframes: Vec<_> = newest.map(|p| Arc::clone(&p.keyframe)).collect();
+        let mut keyframes: Vec<_> = newest.cloned().collect();
         keyframes.reverse();
         keyframes.extend(batch.keyframes.iter().cloned());
         keyframes
