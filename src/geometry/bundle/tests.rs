@@ -278,12 +278,6 @@ fn a_long_loop_moves_as_a_whole() {
         truth.add_point(point, seen);
     }
     let mut found = disturbed(&truth, 1.0);
-    let begun = crate::clock::Stopwatch::start();
     let report = adjust(&mut found, &settings(8, 5.0, false));
-    let secs = begun.secs() / report.n_steps as f64;
-    eprintln!(
-        "{} sights, {secs:.3} s a step: {report:?}",
-        truth.observations.len()
-    );
     assert!(report.cost_after < 1e-3 * report.cost_before, "{report:?}");
 }
