@@ -156,36 +156,6 @@ fn on_a_line_the_orientations_say_the_roll() {
     }
 }
 
-/// A road that bends by a thousandth of its length, followed to within a few centimetres.
-#[test]
-fn a_path_that_is_nearly_a_line_says_that_its_roll_is_loose() {
-    let mut rng = Pcg64Mcg::seed_from_u64(8);
-    let along = |ix: i32| DVec3::new(0.1 * (0.3 * f64::from(ix)).sin(), 0.0, 3.0 * f64::from(ix));
-    let road: Vec<Rigid> = (0..30)
-        .map(|ix| Rigid::new(DQuat::IDENTITY, along(ix)))
-        .collect();
-    let mut driven = |error: f64| {
-        let shaken = |pose: &Rigid| {
-            Rigid::new(
-                pose.rotation,
-                pose.translation + vector(&mut rng, 1.0) * error,
-            )
-        };
-        let run: Vec<Rigid> = road.iter().map(shaken).collect();
-        compare(&timed(&run), &timed(&road))
-    };
-    let loose = driven(0.1);
-    let note = loose.note.unwrap();
-    assert!(note.contains("nearly on a line"), "{note}");
-    // The orientations are exact, so the roll that they ask for leaves only the tilt of the fitted line.
-    let without: f64 = note.rsplit(' ').next().unwrap().parse().unwrap();
-    assert!(
-        without < 0.2 && loose.rotation_mean_deg.unwrap() > without,
-        "{note}"
-    );
-    assert_eq!(driven(0.001).note, None);
-}
-
 #[test]
 fn too_few_poses_or_one_place_cannot_be_aligned_and_say_so() {
     let mut rng = Pcg64Mcg::seed_from_u64(5);
@@ -327,7 +297,9 @@ fn real_trajectories_get_the_figures_of_an_independent_program() {
                 "{name}: {figures:?} {expected}"
             );
         }
-        assert_eq!(figures.note, None, "{name}");
+        // The only one that drives straight ahead.
+        let is_loose = figures.note.is_some_and(|n| n.contains("nearly on a line"));
+        assert_eq!(is_loose, name == "kitti_vo1", "{name}");
     }
 }
 

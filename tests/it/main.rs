@@ -11,6 +11,7 @@ mod bags;
 mod declared_lengths;
 mod engine;
 mod eval;
+mod eval_lines;
 mod exposures;
 mod formats;
 mod gauge;
