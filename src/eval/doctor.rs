@@ -286,7 +286,7 @@ fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {
         ),
         _ => Check::optional(
             "onnx runtime",
-            "none; only --geometry onnx:FILE, eval.lpips_model and sfm.features=xfeat need it",
+            "none; onnx:FILE geometry, eval.lpips_model and xfeat features need it",
             ONNX_RUNTIME_FIX,
         ),
     }

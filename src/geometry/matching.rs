@@ -2,8 +2,11 @@
 //!
 //! Knows nothing of pictures or cameras. Integer arithmetic, so the result is the same on every machine.
 
+mod bytes;
+
 use std::hint::black_box;
 
+pub use self::bytes::{Bytes, MAX_COMPONENT};
 use crate::geometry::features::{Descriptors, SIFT_LENGTH, XFEAT_LENGTH};
 
 /// SIFT: highest ratio of the nearest to the second nearest distance (Lowe 2004, section 7.1).
@@ -28,7 +31,7 @@ const BITS: u16 = 256;
 /// Descriptors laid out for comparing all with all. Those of different kinds never match.
 #[derive(Debug, Clone)]
 pub enum Comparable {
-    Sift(Words<128>),
+    Sift(Bytes),
     Orb(Bits),
     Xfeat(Words<64>),
 }
@@ -52,16 +55,7 @@ pub struct Bits {
 impl Comparable {
     pub fn new(descriptors: &Descriptors) -> Self {
         match descriptors {
-            Descriptors::Sift(all) => {
-                let rows: Vec<[u16; 128]> = all.iter().map(|d| d.map(u16::from)).collect();
-                let square = |row: &[u16; 128]| row.iter().map(|v| u32::from(*v).pow(2)).sum();
-                let longest: u32 = rows.iter().map(square).max().unwrap_or(0);
-                assert!(
-                    longest <= u32::from(u16::MAX),
-                    "products of SIFT descriptors pass 16 bits"
-                );
-                Self::Sift(Words::new(&rows))
-            }
+            Descriptors::Sift(all) => Self::Sift(Bytes::new(all)),
             Descriptors::Orb(all) => Self::Orb(Bits::new(all)),
             Descriptors::Xfeat(all) => {
                 let square = |row: &[i16; 64]| row.iter().map(|v| i32::from(*v).pow(2)).sum();
@@ -171,9 +165,12 @@ pub fn matches(a: &Comparable, b: &Comparable) -> Vec<(u32, u32)> {
 type BothWays = (Vec<Nearest>, Vec<Nearest>);
 
 #[multiversion::multiversion(targets("x86_64+avx2", "aarch64+neon"))]
-fn nearest_sift(a: &Words<128>, b: &Words<128>) -> BothWays {
+fn nearest_sift(a: &Bytes, b: &Bytes) -> BothWays {
     nearest((a.len, b.len), |group, block| {
-        products((a, group), (b, block), 0)
+        multiversion::target::match_target! {
+            "x86_64+avx2" => bytes::products_avx2((a, group), (b, block)),
+            _ => bytes::products((a, group), (b, block)),
+        }
     })
 }
 

@@ -6,6 +6,7 @@
 use rayon::prelude::*;
 
 use super::{Descriptors, Features, SIFT_LENGTH};
+use crate::geometry::matching::MAX_COMPONENT;
 use crate::geometry::scale_space::{Blob, Grey, Octave, blobs, pyramid};
 
 /// Cells along one side of the descriptor, and directions in each.
@@ -275,5 +276,8 @@ fn root_bytes(histogram: &mut [f32; LENGTH]) -> [u8; LENGTH] {
         *v = (*v / length).min(0.2);
     }
     let sum = histogram.iter().sum::<f32>().max(1e-12);
-    std::array::from_fn(|i| (SIFT_LENGTH * (histogram[i] / sum).sqrt()).round() as u8)
+    std::array::from_fn(|i| {
+        let byte = (SIFT_LENGTH * (histogram[i] / sum).sqrt()).round() as u8;
+        byte.min(MAX_COMPONENT)
+    })
 }

@@ -184,3 +184,20 @@ fn kinds_never_match_each_other() {
         }
     }
 }
+
+#[test]
+fn products_of_bytes_without_avx2_are_dot_products() {
+    let (a, b) = sift_sets(7, 45, 9);
+    let (rows, columns) = (Bytes::new(&a), Bytes::new(&b));
+    let found = bytes::products((&rows, 1), (&columns, 1));
+    for (r, lanes) in found.iter().enumerate() {
+        for (lane, product) in lanes.as_flattened().iter().enumerate() {
+            let pair = a.get(ROWS + r).zip(b.get(LANES + lane));
+            let dot = pair.map_or(0, |(a, b)| {
+                let all = a.iter().zip(b).map(|(x, y)| u32::from(*x) * u32::from(*y));
+                all.sum::<u32>()
+            });
+            assert_eq!(u32::from(*product), dot, "{r} {lane}");
+        }
+    }
+}

@@ -5,11 +5,14 @@
 //! smaller window in which pixels of its own luma count most (Yoon and Kweon 2006); where no depth matches, there is
 //! none.
 
+use glam::Vec2;
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::Prepared;
+use super::grey::Grey;
 use super::sweep::Warp;
-use super::zncc::{NOISE_VARIANCE, WINDOW};
+use super::zncc::{NOISE_VARIANCE, WINDOW, integer};
 
 /// Relative difference of depth that is a jump.
 pub(super) const JUMP: f32 = 0.04;
@@ -159,13 +162,7 @@ impl Support {
             down.as_vec2() / RADIUS as f32,
         );
         let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
-        let mut seen = [0.0_f32; SIDE * SIDE];
-        for (row, values) in seen.chunks_exact_mut(SIDE).enumerate() {
-            let start = corner + down * row as f32;
-            for (column, value) in values.iter_mut().enumerate() {
-                *value = warp.source.sample(start + right * column as f32);
-            }
-        }
+        let seen = sampled(warp.source, corner, right, down);
         let mean: f32 = self.weights.iter().zip(&seen).map(|(w, v)| w * v).sum();
         let (mut variance, mut covariance) = (NOISE_VARIANCE, 0.0);
         for ((weight, own), other) in self.weights.iter().zip(&self.values).zip(&seen) {
@@ -174,4 +171,42 @@ impl Support {
         }
         Some(covariance / (self.variance * variance).sqrt())
     }
+}
+
+/// A window, filled up to whole registers.
+const LANES: usize = (SIDE * SIDE).next_multiple_of(16);
+
+/// Bilinear values of a window that lies within the picture, row by row.
+#[multiversion(targets("x86_64+avx2"))]
+fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES] {
+    let (mut index, mut share_x, mut share_y) = ([0_u32; LANES], [0.0; LANES], [0.0; LANES]);
+    let last = [source.width - 2, source.height - 2].map(|cell| cell as f32);
+    let (mut columns, mut rows) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+    for k in 0..SIDE * SIDE {
+        (columns[k], rows[k]) = ((k % SIDE) as f32, (k / SIDE) as f32);
+    }
+    for k in 0..LANES {
+        let u = corner.x + right.x * columns[k] + down.x * rows[k];
+        let v = corner.y + right.y * columns[k] + down.y * rows[k];
+        // Rounding may put a corner just beyond the border.
+        let (left, top) = (
+            u.max(0.0).min(last[0]).floor(),
+            v.max(0.0).min(last[1]).floor(),
+        );
+        share_x[k] = u - left;
+        share_y[k] = v - top;
+        index[k] = integer(top) * source.width as u32 + integer(left);
+    }
+    let [mut a, mut b, mut c, mut d] = [[0.0_f32; LANES]; 4];
+    for k in 0..SIDE * SIDE {
+        let at = index[k] as usize;
+        let upper = &source.values[at..at + 2];
+        let lower = &source.values[at + source.width..at + source.width + 2];
+        (a[k], b[k], c[k], d[k]) = (upper[0], upper[1], lower[0], lower[1]);
+    }
+    std::array::from_fn(|k| {
+        let above = a[k] + (b[k] - a[k]) * share_x[k];
+        let below = c[k] + (d[k] - c[k]) * share_x[k];
+        above + (below - above) * share_y[k]
+    })
 }

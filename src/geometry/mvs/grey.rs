@@ -68,23 +68,6 @@ impl Grey {
         }
     }
 
-    /// Bilinear; centres at integers, beyond the outermost centres as at them.
-    pub(super) fn sample(&self, at: glam::Vec2) -> f32 {
-        let (last_x, last_y) = (self.width - 2, self.height - 2);
-        // Negative numbers become 0.
-        let (x, y) = ((at.x as usize).min(last_x), (at.y as usize).min(last_y));
-        let share_x = (at.x - x as f32).clamp(0.0, 1.0);
-        let share_y = (at.y - y as f32).clamp(0.0, 1.0);
-        let from = y * self.width + x;
-        let (upper, lower) = (
-            &self.values[from..from + 2],
-            &self.values[from + self.width..from + self.width + 2],
-        );
-        let above = upper[0] + (upper[1] - upper[0]) * share_x;
-        let below = lower[0] + (lower[1] - lower[0]) * share_x;
-        above + (below - above) * share_y
-    }
-
     pub(super) fn row(&self, y: usize) -> &[f32] {
         &self.values[y * self.width..(y + 1) * self.width]
     }

@@ -203,7 +203,7 @@ fn warp_row(warp: &Warp<'_>, row: &WarpedRow, values: &mut [f32], seen: &mut [f3
 
 /// Of a whole number from 0 to 2^22; a conversion by `as` is not vectorised for its care about NaN and overflow.
 #[inline(always)]
-fn integer(whole: f32) -> u32 {
+pub(super) fn integer(whole: f32) -> u32 {
     (whole + TO_INTEGER).to_bits() & 0x007F_FFFF
 }
 
