@@ -8,6 +8,7 @@ mod file;
 pub mod onnx;
 mod range;
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -379,14 +380,20 @@ impl Settings {
         Ok(params)
     }
 
+    /// One of the same last part, else one that holds it; of several the one that begins most alike.
     fn nearest_key(&self, key: &str) -> Option<String> {
-        let tail = key.rsplit('.').next().unwrap_or(key);
-        let by_tail = self
-            .values
-            .keys()
-            .find(|known| known.rsplit('.').next() == Some(tail));
-        by_tail
-            .or_else(|| self.values.keys().find(|known| known.contains(tail)))
+        let last = |key: &str| key.rsplit('.').next().unwrap_or_default().to_owned();
+        let tail = last(key);
+        let alike = |known: &&String| {
+            let pairs = known.bytes().zip(key.bytes());
+            Reverse(pairs.take_while(|(a, b)| a == b).count())
+        };
+        let nearest = |fits: &dyn Fn(&str) -> bool| {
+            let keys = self.values.keys().filter(|known| fits(known));
+            keys.min_by_key(alike)
+        };
+        nearest(&|known| last(known) == tail)
+            .or_else(|| nearest(&|known| known.contains(&tail)))
             .cloned()
     }
 }

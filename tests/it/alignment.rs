@@ -22,7 +22,7 @@ use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
 use crate::scenes::scene;
 use crate::sfm::shown;
 
-/// Of the issue: median epipolar error after, and pose error after over before.
+/// Asked for: median epipolar error after, and pose error after over before.
 const MAX_AFTER_PX: f64 = 1.0;
 const MAX_LEFT: f64 = 0.4;
 /// Of the extent, after 200 steps; measured 0.46 (docs/ALIGNMENT.md).
