@@ -388,13 +388,10 @@ impl Settings {
             let pairs = known.bytes().zip(key.bytes());
             Reverse(pairs.take_while(|(a, b)| a == b).count())
         };
-        let nearest = |fits: &dyn Fn(&str) -> bool| {
-            let keys = self.values.keys().filter(|known| fits(known));
-            keys.min_by_key(alike)
-        };
-        nearest(&|known| last(known) == tail)
-            .or_else(|| nearest(&|known| known.contains(&tail)))
-            .cloned()
+        let keys = || self.values.keys();
+        let same = keys().filter(|known| last(known) == tail).min_by_key(alike);
+        let holding = keys().filter(|known| known.contains(&tail));
+        same.or_else(|| holding.min_by_key(alike)).cloned()
     }
 }
 

@@ -73,7 +73,7 @@ pub enum FeaturesError {
     )]
     NoModel,
     #[error("sfm.features=xfeat: {0}")]
-    Onnx(#[from] OnnxError),
+    Onnx(OnnxError),
     #[error("sfm.xfeat_model is no XFeat network: {reason}; docs/FORMATS.md has the contract: {}", path.display())]
     Model { reason: String, path: PathBuf },
 }

@@ -48,8 +48,15 @@ pub enum ModelError {
         width: usize,
         height: usize,
     },
-    #[error("--geometry onnx: {0}")]
-    Onnx(#[from] OnnxError),
+    #[error("--geometry onnx (sfm needs no network): {0}")]
+    Onnx(OnnxError),
+}
+
+/// The message holds it whole: as a source it would be told twice.
+impl From<OnnxError> for ModelError {
+    fn from(error: OnnxError) -> Self {
+        Self::Onnx(error)
+    }
 }
 
 /// Answers with what a network says. Its frame is the first camera that it placed.
