@@ -222,19 +222,13 @@ impl Foundation {
             self.losses
                 .lose_link(joined.note.take().unwrap_or_default());
         }
-        let views = std::mem::take(&mut joined.views);
-        let (mut fresh, mut again) = (Vec::new(), Vec::new());
-        for view in views {
-            let is_placed = self.placed.contains_key(&view.keyframe_id);
-            if is_placed { &mut again } else { &mut fresh }.push(view);
-        }
-        for view in fresh.iter().chain(&again) {
-            let keyframe = keyframes.iter().find(|k| k.id == view.keyframe_id);
-            if let Some(keyframe) = keyframe {
-                self.placed.insert(view.keyframe_id, Arc::clone(keyframe));
-            }
-        }
-        fresh
+        let mut views = joined.views;
+        let is_told = |k: &Arc<Keyframe>| views.iter().any(|view| view.keyframe_id == k.id);
+        let told = keyframes.into_iter().filter(is_told);
+        let told: Vec<_> = told.map(|k| (k.id, k)).collect();
+        views.retain(|view| !self.placed.contains_key(&view.keyframe_id));
+        self.placed.extend(told);
+        views
     }
 
     /// The batch, behind some placed keyframes where it shares none itself: its neighbour was dropped.
