@@ -23,8 +23,29 @@ pub struct Point {
     pub angle_rad: f64,
 }
 
-/// Matches joined over all pairs. A track that meets a view twice is a mistake somewhere and goes.
+/// The longest tracks of a window.
 pub fn tracks(matched: &Matched) -> Vec<Track> {
+    let mut tracks = all_tracks(matched);
+    tracks.truncate(MAX_TRACKS);
+    tracks
+}
+
+/// The longest tracks of many views, until each view has `per_view` of them or no more.
+pub fn covering_tracks(matched: &Matched, per_view: usize) -> Vec<Track> {
+    let mut counts = vec![0; matched.shots.len()];
+    let mut tracks = all_tracks(matched);
+    tracks.retain(|track| {
+        let is_wanted = track.iter().any(|&(view, _)| counts[view] < per_view);
+        if is_wanted {
+            track.iter().for_each(|&(view, _)| counts[view] += 1);
+        }
+        is_wanted
+    });
+    tracks
+}
+
+/// Matches joined over all pairs, the longest first. A track that meets a view twice is a mistake somewhere and goes.
+fn all_tracks(matched: &Matched) -> Vec<Track> {
     let mut first = Vec::with_capacity(matched.shots.len());
     let mut n = 0;
     for shot in &matched.shots {
@@ -52,7 +73,6 @@ pub fn tracks(matched: &Matched) -> Vec<Track> {
     });
     // Stable: equals stay in the order of views and features.
     members.sort_by_key(|track| std::cmp::Reverse(track.len()));
-    members.truncate(MAX_TRACKS);
     members
 }
 

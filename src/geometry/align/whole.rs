@@ -1,0 +1,266 @@
+//! All keyframes of a component -> poses that agree as a whole: what windows drift by is found where their pictures
+//! see the same surface again.
+//!
+//! Windows are corrected with a few neighbours held, so that small errors add up along the way. This keeps of each
+//! keyframe its features, its pose and a few depths, and adjusts them all (`geometry::bundle`) now and then.
+
+use std::collections::BTreeMap;
+
+use super::bundle_state::State;
+use super::matches::Matcher;
+use super::tracks::{Track, covering_tracks, points};
+use super::{Given, MAX_POINT_ERROR_PX, Matched, depths, longest_px, rescale, unit};
+use crate::config::align::AlignParams;
+use crate::frame::DepthMap;
+use crate::geometry::bundle::{Camera, Observation, Problem, Settings, adjust};
+use crate::geometry::two_view::median;
+use crate::geometry::{Revision, View};
+use crate::pose::Rigid;
+
+/// Side of the grid of depths that is kept of a view.
+const GRID: usize = 24;
+/// Points that each view should have.
+const TRACKS_PER_VIEW: usize = 200;
+/// Sights below which a view moves as its neighbour does.
+const MIN_SIGHTS: usize = 12;
+/// Views below which windows say all there is.
+const MIN_VIEWS: usize = 4;
+/// Corrected again when a component has grown by this share, and by so many.
+const GROWTH: f64 = 1.0 / 3.0;
+const MIN_GROWTH: usize = 6;
+/// Cauchy's loss bends at so many px, from rough to fine, for so many steps each.
+const ROUNDS: [(f64, usize); 3] = [(16.0, 15), (4.0, 15), (1.0, 25)];
+/// What holds a pose where nothing else does: standard deviations as a share of the median depth, and in radians.
+/// Also the frame and unit of the whole.
+const PLACE_PRIOR: f64 = 0.05;
+const TURN_PRIOR: f64 = 0.035;
+/// Where keyframes had to be forgotten, the oldest of those left are held, one in so many: the map behind stays.
+const HELD_SHARE: usize = 8;
+
+/// What is remembered of the keyframes of all components.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Whole {
+    /// With a grid of depths each.
+    views: BTreeMap<u32, View>,
+    /// Keyframes at the last correction, by component.
+    n_corrected: BTreeMap<u32, usize>,
+    /// Component of which keyframes were forgotten.
+    cut: Option<u32>,
+    is_uncalibrated: bool,
+}
+
+/// What a correction of a whole component found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Correction {
+    /// Every keyframe of the component.
+    pub(super) revised: Vec<Revision>,
+    /// Factor on a keyframe's depth.
+    pub(super) depth_factors: BTreeMap<u32, f64>,
+}
+
+impl Whole {
+    /// Remembers new keyframes in their running frame, at most `max` in all.
+    pub(super) fn add(&mut self, views: &[View], given: Given, max: usize) {
+        for view in views {
+            let thumbnail = View {
+                depth: thumbnail(&view.depth),
+                ..view.clone()
+            };
+            self.views.insert(view.keyframe_id, thumbnail);
+        }
+        self.is_uncalibrated |= !given.is_calibrated;
+        while self.views.len() > max {
+            self.cut = self.views.pop_first().map(|(_, view)| view.component);
+        }
+    }
+
+    /// Whether so much is new that a component should be corrected.
+    pub(super) fn is_due(&self, component: u32) -> bool {
+        let (n, before) = (self.n_of(component), self.n_before(component));
+        n >= before + MIN_GROWTH.max((before as f64 * GROWTH) as usize)
+    }
+
+    /// Components in which anything is new.
+    pub(super) fn changed(&self) -> Vec<u32> {
+        let mut components: Vec<u32> = self.views.values().map(|v| v.component).collect();
+        components.sort_unstable();
+        components.dedup();
+        components.retain(|&c| self.n_of(c) != self.n_before(c));
+        components
+    }
+
+    /// Moves all keyframes of a component so that their matches fit; `None` where nothing better was found.
+    pub(super) fn correct(
+        &mut self,
+        component: u32,
+        matcher: &mut Matcher,
+        params: &AlignParams,
+    ) -> Option<Correction> {
+        let mut views: Vec<View> = self
+            .views
+            .values()
+            .filter(|v| v.component == component)
+            .cloned()
+            .collect();
+        self.n_corrected.insert(component, views.len());
+        if views.len() < MIN_VIEWS {
+            return None;
+        }
+        let n_held = if self.cut == Some(component) {
+            views.len() / HELD_SHARE
+        } else {
+            0
+        };
+        let mut matched = matcher.matched_anew(&views, params.max_matches);
+        let tracks = covering_tracks(&matched, TRACKS_PER_VIEW);
+        let given = Given {
+            n_held,
+            is_calibrated: !self.is_uncalibrated,
+        };
+        let before_px = error_px(&matched, &tracks);
+        bundle(&views, &mut matched, &tracks, given);
+        let after_px = error_px(&matched, &tracks);
+        tracing::debug!(
+            component,
+            keyframes = views.len(),
+            tracks = tracks.len(),
+            before_px,
+            after_px,
+            "whole component"
+        );
+        let is_better = after_px? < before_px.unwrap_or(f64::INFINITY);
+        if !is_better {
+            return None;
+        }
+        super::write_back(&mut views, &matched);
+        let limit = MAX_POINT_ERROR_PX * longest_px(&matched) / 640.0;
+        let points = points(&matched, &tracks, limit);
+        let factors = rescale::depth(&mut views, &matched, &points, n_held);
+        let mut correction = Correction::default();
+        for (view, factor) in views.into_iter().zip(factors) {
+            correction.revised.push(Revision {
+                keyframe_id: view.keyframe_id,
+                component,
+                intrinsics: view.intrinsics,
+                batch_from_cam: view.batch_from_cam,
+            });
+            correction.depth_factors.insert(view.keyframe_id, factor);
+            self.views.insert(view.keyframe_id, view);
+        }
+        Some(correction)
+    }
+
+    fn n_of(&self, component: u32) -> usize {
+        let own = self.views.values().filter(|v| v.component == component);
+        own.count()
+    }
+
+    fn n_before(&self, component: u32) -> usize {
+        self.n_corrected.get(&component).copied().unwrap_or(0)
+    }
+}
+
+/// Median distance of the sights from their points.
+fn error_px(matched: &Matched, tracks: &[Track]) -> Option<f64> {
+    let all = points(matched, tracks, f64::INFINITY);
+    median(&mut all.iter().map(|p| p.error_px).collect::<Vec<_>>())
+}
+
+/// Bundle adjustment of all views and tracks.
+fn bundle(views: &[View], matched: &mut Matched, tracks: &[Track], given: Given) {
+    let state = State::new(matched, tracks, &depths(views, matched));
+    let hold = hold(unit(views));
+    let mut n_sights = vec![0; views.len()];
+    let mut problem = Problem::default();
+    for (ix, shot) in matched.shots.iter().enumerate() {
+        problem.cameras.push(Camera {
+            cam_from_map: shot.cam_from_batch,
+            intrinsics: shot.lens,
+            radial: 0.0,
+            is_fixed: ix < given.n_held,
+            hold: Some(hold),
+            shares_lens: !given.is_calibrated,
+        });
+    }
+    for (track, start) in state.tracks.iter().zip(&state.points) {
+        let seen = track.iter().map(|&(view, feature)| {
+            n_sights[view] += 1;
+            Observation {
+                camera_ix: view as u32,
+                pixel: matched.shots[view].pixels[feature],
+            }
+        });
+        problem.add_point(*start, seen);
+    }
+    for (loss_px, max_steps) in ROUNDS {
+        let settings = Settings {
+            max_steps,
+            loss_px,
+            refine_focal: !given.is_calibrated,
+            refine_radial: false,
+        };
+        adjust(&mut problem, &settings);
+    }
+    if !problem.cameras.iter().all(|c| c.cam_from_map.is_finite()) {
+        return;
+    }
+    let motions: Vec<Rigid> = problem
+        .cameras
+        .iter()
+        .zip(&matched.shots)
+        .map(|(camera, shot)| camera.cam_from_map.inverse() * shot.cam_from_batch)
+        .collect();
+    for (ix, (shot, camera)) in matched.shots.iter_mut().zip(&problem.cameras).enumerate() {
+        shot.is_held = ix < given.n_held;
+        shot.lens = camera.intrinsics;
+        let leader = leader(&n_sights, ix);
+        if leader == ix {
+            shot.cam_from_batch = camera.cam_from_map;
+        } else {
+            shot.cam_from_batch = (shot.cam_from_batch * motions[leader].inverse()).renormalized();
+        }
+    }
+}
+
+/// The view itself if it sees enough, else the nearest one that does.
+fn leader(n_sights: &[usize], ix: usize) -> usize {
+    let sees = |&i: &usize| n_sights[i] >= MIN_SIGHTS;
+    (0..n_sights.len())
+        .filter(sees)
+        .min_by_key(|i| i.abs_diff(ix))
+        .unwrap_or(ix)
+}
+
+fn hold(unit: f64) -> [[f64; 6]; 6] {
+    let mut hold = [[0.0; 6]; 6];
+    for (i, row) in hold.iter_mut().enumerate() {
+        let std = if i < 3 {
+            PLACE_PRIOR * unit
+        } else {
+            TURN_PRIOR
+        };
+        row[i] = std.powi(-2);
+    }
+    hold
+}
+
+/// Every so manieth pixel.
+fn thumbnail(depth: &DepthMap) -> DepthMap {
+    let (w, h) = (depth.width_px as usize, depth.height_px as usize);
+    if w == 0 || h == 0 {
+        return DepthMap::none();
+    }
+    let (new_w, new_h) = (w.min(GRID), h.min(GRID));
+    let at = |k: usize| {
+        let (x, y) = (k % new_w, k / new_w);
+        let middle = |i: usize, n: usize, of: usize| (2 * i + 1) * of / (2 * n);
+        middle(y, new_h, h) * w + middle(x, new_w, w)
+    };
+    let picked = |values: &[f32]| (0..new_w * new_h).map(|k| values[at(k)]).collect();
+    DepthMap {
+        width_px: new_w as u32,
+        height_px: new_h as u32,
+        depth: picked(&depth.depth),
+        confidence: picked(&depth.confidence),
+    }
+}
