@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::{Matched, Pair, Shot};
+use super::{Matched, Pair, Shot, depth_at};
 use crate::config::SfmParams;
 use crate::config::align::AlignParams;
 use crate::frame::RgbImage;
@@ -186,6 +186,13 @@ impl Matcher {
             is_held: false,
             pixels: held.map_or_else(Vec::new, |held| held.features.pixels.clone()),
         }
+    }
+
+    /// The view's depth at each of its features.
+    pub(super) fn depths(&self, view: &View) -> Vec<Option<f64>> {
+        let shot = self.shot(view);
+        let at = |pixel: &DVec2| depth_at(&view.depth, &shot.lens, *pixel);
+        shot.pixels.iter().map(at).collect()
     }
 
     /// Matches of two views, the one with the lower id first, that agree with one rigid scene.

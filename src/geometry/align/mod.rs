@@ -3,6 +3,7 @@
 //!
 //! docs/ALIGNMENT.md has the procedures, the noise that they are measured with and the figures.
 
+mod agreeing;
 pub mod bundle_state;
 pub mod depth_bundle;
 pub mod epipolar;
@@ -171,7 +172,8 @@ impl Aligner {
         if self.params.whole == 0 {
             return;
         }
-        self.whole.add(fresh, given, self.params.whole);
+        self.whole
+            .add(fresh, &self.matcher, given, self.params.whole);
         if !self.whole.is_due(component) {
             return;
         }

@@ -2,18 +2,18 @@
 //! see the same surface again.
 //!
 //! Windows are corrected with a few neighbours held, so that small errors add up along the way. This keeps of each
-//! keyframe its features, its pose and a few depths, and adjusts them all (`geometry::bundle`) now and then.
+//! keyframe its features, their depth and its pose, and adjusts them all (`geometry::bundle`) now and then.
 
 use std::collections::BTreeMap;
 
-use super::bundle_state::State;
+use super::agreeing::{Agreeing, agreeing};
+use super::bundle_state::Depths;
 use super::matches::Matcher;
 use super::tracks::{Track, covering_tracks, points};
-use super::{Given, MAX_POINT_ERROR_PX, Matched, depths, longest_px, rescale, unit};
+use super::{Given, MAX_POINT_ERROR_PX, Matched, longest_px, rescale, unit};
 use crate::config::align::AlignParams;
 use crate::frame::DepthMap;
 use crate::geometry::bundle::{Camera, Observation, Problem, Settings, adjust};
-use crate::geometry::two_view::median;
 use crate::geometry::{Revision, View};
 use crate::pose::Rigid;
 
@@ -28,8 +28,10 @@ const MIN_VIEWS: usize = 4;
 /// Corrected again when a component has grown by this share, and by so many.
 const GROWTH: f64 = 1.0 / 3.0;
 const MIN_GROWTH: usize = 6;
-/// Cauchy's loss bends at so many px, from rough to fine, for so many steps each.
-const ROUNDS: [(f64, usize); 3] = [(16.0, 15), (4.0, 15), (1.0, 25)];
+/// From rough to fine: sights agree up to so many px (of a picture of 640), Cauchy's loss bends at this share of it, for so
+/// many steps.
+const ROUNDS: [(f64, usize); 3] = [(24.0, 12), (8.0, 12), (MAX_POINT_ERROR_PX, 20)];
+const LOSS_SHARE: f64 = 0.25;
 /// What holds a pose where nothing else does: standard deviations as a share of the median depth, and in radians.
 /// Also the frame and unit of the whole.
 const PLACE_PRIOR: f64 = 0.05;
@@ -40,8 +42,8 @@ const HELD_SHARE: usize = 8;
 /// What is remembered of the keyframes of all components.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Whole {
-    /// With a grid of depths each.
-    views: BTreeMap<u32, View>,
+    /// With a grid of depths each, and the depth of each feature.
+    views: BTreeMap<u32, (View, Vec<Option<f64>>)>,
     /// Keyframes at the last correction, by component.
     n_corrected: BTreeMap<u32, usize>,
     /// Component of which keyframes were forgotten.
@@ -60,17 +62,18 @@ pub(super) struct Correction {
 
 impl Whole {
     /// Remembers new keyframes in their running frame, at most `max` in all.
-    pub(super) fn add(&mut self, views: &[View], given: Given, max: usize) {
+    pub(super) fn add(&mut self, views: &[View], matcher: &Matcher, given: Given, max: usize) {
         for view in views {
+            let depths = matcher.depths(view);
             let thumbnail = View {
                 depth: thumbnail(&view.depth),
                 ..view.clone()
             };
-            self.views.insert(view.keyframe_id, thumbnail);
+            self.views.insert(view.keyframe_id, (thumbnail, depths));
         }
         self.is_uncalibrated |= !given.is_calibrated;
         while self.views.len() > max {
-            self.cut = self.views.pop_first().map(|(_, view)| view.component);
+            self.cut = self.views.pop_first().map(|(_, (view, _))| view.component);
         }
     }
 
@@ -82,7 +85,7 @@ impl Whole {
 
     /// Components in which anything is new.
     pub(super) fn changed(&self) -> Vec<u32> {
-        let mut components: Vec<u32> = self.views.values().map(|v| v.component).collect();
+        let mut components: Vec<u32> = self.views.values().map(|(v, _)| v.component).collect();
         components.sort_unstable();
         components.dedup();
         components.retain(|&c| self.n_of(c) != self.n_before(c));
@@ -96,48 +99,53 @@ impl Whole {
         matcher: &mut Matcher,
         params: &AlignParams,
     ) -> Option<Correction> {
-        let mut views: Vec<View> = self
+        let (mut views, depths): (Vec<View>, Depths) = self
             .views
             .values()
-            .filter(|v| v.component == component)
+            .filter(|(v, _)| v.component == component)
             .cloned()
-            .collect();
+            .unzip();
         self.n_corrected.insert(component, views.len());
         if views.len() < MIN_VIEWS {
             return None;
         }
-        let n_held = if self.cut == Some(component) {
-            views.len() / HELD_SHARE
-        } else {
-            0
+        let is_cut = self.cut == Some(component);
+        let given = Given {
+            n_held: if is_cut { views.len() / HELD_SHARE } else { 0 },
+            is_calibrated: !self.is_uncalibrated,
         };
         let mut matched = matcher.matched_anew(&views, params.max_matches);
         let tracks = covering_tracks(&matched, TRACKS_PER_VIEW);
-        let given = Given {
-            n_held,
-            is_calibrated: !self.is_uncalibrated,
+        let limit = MAX_POINT_ERROR_PX * longest_px(&matched) / 640.0;
+        let n_agreeing = |matched: &Matched| {
+            let found = agreeing(matched, &tracks, &depths, (limit, params.depth_error));
+            found.iter().map(|a| a.track.len()).sum::<usize>()
         };
-        let before_px = error_px(&matched, &tracks);
-        bundle(&views, &mut matched, &tracks, given);
-        let after_px = error_px(&matched, &tracks);
+        let before = n_agreeing(&matched);
+        adjust_all(
+            &views,
+            &mut matched,
+            (&tracks, &depths),
+            params.depth_error,
+            given,
+        );
+        let after = n_agreeing(&matched);
         tracing::debug!(
             component,
-            keyframes = views.len(),
-            tracks = tracks.len(),
-            before_px,
-            after_px,
-            "whole component"
+            n = views.len(),
+            n_tracks = tracks.len(),
+            before,
+            after,
+            "whole"
         );
-        let is_better = after_px? < before_px.unwrap_or(f64::INFINITY);
-        if !is_better {
+        if after < before {
             return None;
         }
         super::write_back(&mut views, &matched);
-        let limit = MAX_POINT_ERROR_PX * longest_px(&matched) / 640.0;
         let points = points(&matched, &tracks, limit);
-        let factors = rescale::depth(&mut views, &matched, &points, n_held);
+        let factors = rescale::depth(&mut views, &matched, &points, given.n_held);
         let mut correction = Correction::default();
-        for (view, factor) in views.into_iter().zip(factors) {
+        for ((view, factor), mut depths) in views.into_iter().zip(factors).zip(depths) {
             correction.revised.push(Revision {
                 keyframe_id: view.keyframe_id,
                 component,
@@ -145,13 +153,17 @@ impl Whole {
                 batch_from_cam: view.batch_from_cam,
             });
             correction.depth_factors.insert(view.keyframe_id, factor);
-            self.views.insert(view.keyframe_id, view);
+            depths.iter_mut().flatten().for_each(|d| *d *= factor);
+            self.views.insert(view.keyframe_id, (view, depths));
         }
         Some(correction)
     }
 
     fn n_of(&self, component: u32) -> usize {
-        let own = self.views.values().filter(|v| v.component == component);
+        let own = self
+            .views
+            .values()
+            .filter(|(v, _)| v.component == component);
         own.count()
     }
 
@@ -160,17 +172,39 @@ impl Whole {
     }
 }
 
-/// Median distance of the sights from their points.
-fn error_px(matched: &Matched, tracks: &[Track]) -> Option<f64> {
-    let all = points(matched, tracks, f64::INFINITY);
-    median(&mut all.iter().map(|p| p.error_px).collect::<Vec<_>>())
+/// Bundle adjustment of all views over the sights that agree with the poses so far, again and again.
+fn adjust_all(
+    views: &[View],
+    matched: &mut Matched,
+    (tracks, depths): (&[Track], &Depths),
+    depth_error: f64,
+    given: Given,
+) {
+    let hold = hold(unit(views));
+    for (limit, max_steps) in ROUNDS {
+        let limit = limit * longest_px(matched) / 640.0;
+        let agreeing = agreeing(matched, tracks, depths, (limit, depth_error));
+        let settings = Settings {
+            max_steps,
+            loss_px: LOSS_SHARE * limit,
+            refine_focal: !given.is_calibrated,
+            refine_radial: false,
+        };
+        let mut problem = problem(matched, &agreeing, hold, given);
+        adjust(&mut problem, &settings);
+        let mut poses = problem.cameras.iter().map(|c| &c.cam_from_map);
+        if !poses.all(Rigid::is_finite) {
+            return;
+        }
+        let mut n_sights = vec![0; views.len()];
+        for &(view, _) in agreeing.iter().flat_map(|a| &a.track) {
+            n_sights[view] += 1;
+        }
+        take_over(matched, &problem.cameras, &n_sights);
+    }
 }
 
-/// Bundle adjustment of all views and tracks.
-fn bundle(views: &[View], matched: &mut Matched, tracks: &[Track], given: Given) {
-    let state = State::new(matched, tracks, &depths(views, matched));
-    let hold = hold(unit(views));
-    let mut n_sights = vec![0; views.len()];
+fn problem(matched: &Matched, agreeing: &[Agreeing], hold: [[f64; 6]; 6], given: Given) -> Problem {
     let mut problem = Problem::default();
     for (ix, shot) in matched.shots.iter().enumerate() {
         problem.cameras.push(Camera {
@@ -182,43 +216,32 @@ fn bundle(views: &[View], matched: &mut Matched, tracks: &[Track], given: Given)
             shares_lens: !given.is_calibrated,
         });
     }
-    for (track, start) in state.tracks.iter().zip(&state.points) {
-        let seen = track.iter().map(|&(view, feature)| {
-            n_sights[view] += 1;
-            Observation {
-                camera_ix: view as u32,
-                pixel: matched.shots[view].pixels[feature],
-            }
+    for found in agreeing {
+        let seen = found.track.iter().map(|&(view, feature)| Observation {
+            camera_ix: view as u32,
+            pixel: matched.shots[view].pixels[feature],
         });
-        problem.add_point(*start, seen);
+        problem.add_point(found.point, seen);
     }
-    for (loss_px, max_steps) in ROUNDS {
-        let settings = Settings {
-            max_steps,
-            loss_px,
-            refine_focal: !given.is_calibrated,
-            refine_radial: false,
-        };
-        adjust(&mut problem, &settings);
-    }
-    if !problem.cameras.iter().all(|c| c.cam_from_map.is_finite()) {
-        return;
-    }
-    let motions: Vec<Rigid> = problem
-        .cameras
+    problem
+}
+
+/// Poses as adjusted; those that hardly anything was known of go where their neighbour went.
+fn take_over(matched: &mut Matched, cameras: &[Camera], n_sights: &[usize]) {
+    let motions: Vec<Rigid> = cameras
         .iter()
         .zip(&matched.shots)
         .map(|(camera, shot)| camera.cam_from_map.inverse() * shot.cam_from_batch)
         .collect();
-    for (ix, (shot, camera)) in matched.shots.iter_mut().zip(&problem.cameras).enumerate() {
-        shot.is_held = ix < given.n_held;
+    for (ix, (shot, camera)) in matched.shots.iter_mut().zip(cameras).enumerate() {
+        shot.is_held = camera.is_fixed;
         shot.lens = camera.intrinsics;
-        let leader = leader(&n_sights, ix);
-        if leader == ix {
-            shot.cam_from_batch = camera.cam_from_map;
+        let leader = leader(n_sights, ix);
+        shot.cam_from_batch = if leader == ix || shot.is_held {
+            camera.cam_from_map
         } else {
-            shot.cam_from_batch = (shot.cam_from_batch * motions[leader].inverse()).renormalized();
-        }
+            (shot.cam_from_batch * motions[leader].inverse()).renormalized()
+        };
     }
 }
 
