@@ -3,6 +3,8 @@
 //! Field order is the wire order of the ROS 2 Jazzy interface packages. A payload starts with the four byte
 //! encapsulation header, which says little (CDR_LE) or big endian (CDR_BE). Knows nothing of files or networks.
 
+pub mod odometry;
+
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 

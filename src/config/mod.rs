@@ -7,6 +7,7 @@ pub mod align;
 mod file;
 pub mod onnx;
 mod range;
+pub mod scale;
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -68,6 +69,7 @@ pub struct Params {
     pub align: AlignParams,
     pub onnx: onnx::OnnxParams,
     pub map: MapParams,
+    pub scale: scale::ScaleParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
 }
@@ -87,6 +89,7 @@ pub struct SourceParams {
     pub camera_info_topic: String,
     pub pose_topic: String,
     pub depth_topic: String,
+    pub odometry_topic: String,
     pub names: String,
     pub held_out_names: String,
     pub pick: usize,

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{EvalError, read_text, write_atomically};
-use crate::map::snapshot::ScaleSource;
+use crate::map::snapshot;
 use crate::source::SourceCounts;
 
 const MAX_FILE_BYTES: u64 = 1 << 26;
@@ -151,26 +151,19 @@ impl Latency {
     }
 }
 
-impl Scale {
-    pub fn of(source: ScaleSource) -> Self {
-        match source {
-            ScaleSource::UpToScale => Self {
-                source: "up_to_scale".to_owned(),
-                metres_per_unit: None,
-                std: None,
-            },
-            ScaleSource::Given => Self {
-                source: "given".to_owned(),
-                metres_per_unit: Some(1.0),
-                std: None,
-            },
+impl From<snapshot::Scale> for Scale {
+    fn from(scale: snapshot::Scale) -> Self {
+        Self {
+            source: scale.source.name().to_owned(),
+            metres_per_unit: scale.metres_per_unit,
+            std: scale.std,
         }
     }
 }
 
 impl Default for Scale {
     fn default() -> Self {
-        Self::of(ScaleSource::UpToScale)
+        snapshot::Scale::UP_TO_SCALE.into()
     }
 }
 

@@ -14,7 +14,7 @@ use glam::{DQuat, DVec3};
 use crate::camera::Intrinsics;
 use crate::clock::Stamp;
 use crate::map::layout;
-use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::pose::Rigid;
 use crate::splat::Splats;
 
@@ -155,7 +155,7 @@ struct Meta {
     stamp: Stamp,
     seed: u64,
     steps: u64,
-    scale: ScaleSource,
+    scale: Scale,
 }
 
 /// Checks the file header; returns the number of sections.
@@ -244,13 +244,16 @@ fn meta_bytes(checkpoint: &Checkpoint) -> Vec<u8> {
     bytes.extend_from_slice(&snapshot.stamp.nanos.to_le_bytes());
     bytes.extend_from_slice(&checkpoint.seed.to_le_bytes());
     bytes.extend_from_slice(&checkpoint.steps.to_le_bytes());
-    bytes.push(snapshot.scale.code());
+    let (code, metres, std) = snapshot.scale.to_numbers();
+    bytes.push(code);
+    bytes.extend_from_slice(&metres.to_le_bytes());
+    bytes.extend_from_slice(&std.to_le_bytes());
     bytes
 }
 
 fn parse_meta(content: &[u8]) -> Result<Meta, String> {
     let mut rest = content;
-    let mut parse = || -> io::Result<(Meta, u8)> {
+    let mut parse = || -> io::Result<(Meta, (u8, f64, f64))> {
         let mut map_id = [0; 16];
         rest.read_exact(&mut map_id)?;
         let meta = Meta {
@@ -260,13 +263,20 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
             stamp: Stamp::from_nanos(rest.read_i64::<LittleEndian>()?),
             seed: rest.read_u64::<LittleEndian>()?,
             steps: rest.read_u64::<LittleEndian>()?,
-            scale: ScaleSource::default(),
+            scale: Scale::UP_TO_SCALE,
         };
-        Ok((meta, rest.read_u8()?))
+        let code = rest.read_u8()?;
+        // Files of before scale was measured end here; what was given then was metres.
+        if rest.is_empty() {
+            let metres = if code == Scale::GIVEN.source.code() { 1.0 } else { 0.0 };
+            return Ok((meta, (code, metres, 0.0)));
+        }
+        let metres = rest.read_f64::<LittleEndian>()?;
+        Ok((meta, (code, metres, rest.read_f64::<LittleEndian>()?)))
     };
-    let (meta, code) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
-    let scale =
-        ScaleSource::from_code(code).ok_or_else(|| format!("scale source {code} is unknown"))?;
+    let (meta, numbers) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
+    let scale = Scale::of_numbers(numbers)
+        .ok_or_else(|| format!("scale (source, metres, deviation) {numbers:?} is none"))?;
     Ok(Meta { scale, ..meta })
 }
 

@@ -12,6 +12,7 @@ mod held_out;
 pub mod keyframes;
 pub mod layout;
 mod matches;
+mod metric;
 mod revise;
 pub mod schedule;
 pub mod seed;
@@ -25,12 +26,13 @@ use rand_pcg::Pcg64Mcg;
 use sha2::{Digest, Sha256};
 
 use crate::config::MapParams;
+use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
-use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::splat::{Engine, PoseStep, StepSettings, TrainingView};
 
 /// Keyframes without a pose that are kept in case the model places them later.
@@ -63,7 +65,8 @@ pub struct SplatMap {
     n_put_back: u64,
     /// Share of the input that has come, while more is to come and where it is known.
     progress: Option<f64>,
-    scale: ScaleSource,
+    scale: Scale,
+    scale_params: Option<ScaleParams>,
     seed: u64,
     epoch: u32,
     revision: u32,
@@ -85,7 +88,7 @@ impl std::fmt::Debug for SplatMap {
 }
 
 impl SplatMap {
-    pub fn new(params: MapParams, seed: u64, scale: ScaleSource, engine: Box<dyn Engine>) -> Self {
+    pub fn new(params: MapParams, seed: u64, scale: Scale, engine: Box<dyn Engine>) -> Self {
         Self {
             params,
             engine,
@@ -100,6 +103,7 @@ impl SplatMap {
             n_put_back: 0,
             progress: None,
             scale,
+            scale_params: None,
             seed,
             epoch: 0,
             revision: 0,
@@ -107,6 +111,13 @@ impl SplatMap {
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
         }
+    }
+
+    /// From now on looks for metres by these parameters, unless the geometry has them.
+    #[must_use]
+    pub fn measuring_scale(mut self, params: &ScaleParams) -> Self {
+        self.scale_params = Some(params.clone());
+        self
     }
 
     /// Adds what the model says of a batch; `progress` is the share of the input that has come, where known.
@@ -193,6 +204,7 @@ impl SplatMap {
                 intrinsics: placed.intrinsics.refocused(focal_factor),
             })
             .collect();
+        self.scale = self.measure_scale(&poses);
         self.revision += 1;
         Arc::new(Snapshot {
             map_id: self.map_id(),
@@ -307,6 +319,7 @@ impl SplatMap {
                     self.engine
                         .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
                     (placed.depth, placed.median_depth) = (depth, median_depth);
+                    placed.ratios = None;
                 }
                 placed.health = view.health;
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
@@ -339,6 +352,7 @@ impl SplatMap {
                         median_depth,
                         depth_factor: 1.0,
                         n_depth_looks: 0,
+                        ratios: None,
                         health: view.health,
                         is_held_out,
                     },

@@ -23,7 +23,7 @@ use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
-use crate::map::snapshot::{ScaleSource, Snapshot};
+use crate::map::snapshot::{Scale, Snapshot};
 use crate::node::pipeline::Subscriber;
 use crate::pose::Rigid;
 use crate::source::{Source, SourceCounts};
@@ -123,11 +123,11 @@ impl std::fmt::Debug for Outcome {
 fn model(
     params: &Params,
     truth_extent: Option<f64>,
-) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
+) -> anyhow::Result<(Box<dyn GeometryModel>, Scale)> {
     match params.geometry.as_str() {
         "sfm" => Ok((
             Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
-            ScaleSource::UpToScale,
+            Scale::UP_TO_SCALE,
         )),
         "known" => {
             let known = Known::new(
@@ -138,9 +138,9 @@ fn model(
             )?;
             // Windows have units of their own, as a foundation model's have.
             let scale = if params.known.windows {
-                ScaleSource::UpToScale
+                Scale::UP_TO_SCALE
             } else {
-                ScaleSource::Given
+                Scale::GIVEN
             };
             let known = known.in_windows(&params.align, &params.sfm)?;
             Ok((Box::new(known), scale))
@@ -150,7 +150,7 @@ fn model(
                 let network = Model::open(Path::new(file), &params.onnx)?;
                 let aligner = Aligner::new(&params.align, &params.sfm, params.seed)?;
                 let foundation = Foundation::of(network, &params.onnx, aligner);
-                Ok((Box::new(foundation), ScaleSource::UpToScale))
+                Ok((Box::new(foundation), Scale::UP_TO_SCALE))
             }
             None => bail!("{name:?} is no geometry; expected sfm, known or onnx:FILE"),
         },

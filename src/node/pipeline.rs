@@ -41,7 +41,8 @@ pub fn run(
         job.params.seed,
         scale,
         engine(job.params.backend, job.params.deterministic)?,
-    );
+    )
+    .measuring_scale(&job.params.scale);
     let stages = Stages {
         map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
         select: SelectStage::new(&job.params),

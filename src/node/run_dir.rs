@@ -191,7 +191,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             n_bytes => Some(n_bytes as f64 / (1 << 20) as f64),
         },
         quality,
-        scale: Scale::of(snapshot.scale),
+        scale: snapshot.scale.into(),
         source_fault: outcome.counts.fault.clone(),
         geometry_note: outcome.geometry_note.clone(),
         error: outcome.error.clone(),

@@ -9,7 +9,7 @@ use splat_mapper::camera::Intrinsics;
 use splat_mapper::clock::Stamp;
 use splat_mapper::export::ply;
 use splat_mapper::map::checkpoint::{self, Checkpoint, CheckpointError};
-use splat_mapper::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use splat_mapper::map::snapshot::{KeyframePose, Scale, Snapshot};
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::Splats;
 
@@ -81,7 +81,7 @@ pub(crate) fn random_snapshot(
         epoch: 2,
         revision,
         stamp: poses.last().map_or(Stamp::default(), |pose| pose.stamp),
-        scale: ScaleSource::Given,
+        scale: Scale::GIVEN,
         poses,
         splats: Arc::new(random_splats(n_splats, sh_degree, u64::from(revision))),
     }

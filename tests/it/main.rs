@@ -30,6 +30,7 @@ mod layers;
 mod lenses;
 mod lpips;
 mod mcmc;
+mod metres;
 mod moves;
 mod mvs;
 mod node_over_zenoh;

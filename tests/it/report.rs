@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 use splat_mapper::config::Settings;
 use splat_mapper::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing,
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing,
 };
-use splat_mapper::map::snapshot::ScaleSource;
+use splat_mapper::map::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.
 const KEYS: &str = "\
@@ -86,7 +86,7 @@ pub(crate) fn sample_report() -> Report {
             ssim_holdout: Some(0.791),
             lpips_holdout: None,
         },
-        scale: Scale::of(ScaleSource::UpToScale),
+        scale: snapshot::Scale::UP_TO_SCALE.into(),
         source_fault: None,
         geometry_note: Some(
             "keyframe 21 shares too few features with its neighbours (motion blur)".to_owned(),
