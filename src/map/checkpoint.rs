@@ -268,13 +268,18 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
         let code = rest.read_u8()?;
         // Files of before scale was measured end here; what was given then was metres.
         if rest.is_empty() {
-            let metres = if code == Scale::GIVEN.source.code() { 1.0 } else { 0.0 };
+            let metres = if code == Scale::GIVEN.source.code() {
+                1.0
+            } else {
+                0.0
+            };
             return Ok((meta, (code, metres, 0.0)));
         }
         let metres = rest.read_f64::<LittleEndian>()?;
         Ok((meta, (code, metres, rest.read_f64::<LittleEndian>()?)))
     };
-    let (meta, numbers) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
+    let (meta, numbers) =
+        parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
     let scale = Scale::of_numbers(numbers)
         .ok_or_else(|| format!("scale (source, metres, deviation) {numbers:?} is none"))?;
     Ok(Meta { scale, ..meta })

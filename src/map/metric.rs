@@ -139,7 +139,11 @@ fn height_above_floor(depth: &DepthMap, lens: &Intrinsics, seed: u64) -> Option<
             continue;
         }
         let is_on = |p: &&DVec3| (normal.dot(**p) - height).abs() < FLOOR_ERROR * height;
-        let on: Vec<f64> = points.iter().filter(is_on).map(|p| normal.dot(*p)).collect();
+        let on: Vec<f64> = points
+            .iter()
+            .filter(is_on)
+            .map(|p| normal.dot(*p))
+            .collect();
         if best.is_none_or(|(n, _)| on.len() > n) {
             best = Some((on.len(), on.iter().sum::<f64>() / on.len().max(1) as f64));
         }
@@ -231,7 +235,12 @@ fn estimates<'a>(
 ) -> Vec<(ScaleSource, Option<Estimate>)> {
     let may = |known: Known| params.known == Known::Auto || params.known == known;
     let placed: Vec<&Placed> = placed.collect();
-    let all = |which: usize| placed.iter().filter_map(|p| p.ratio(which)).collect::<Vec<_>>();
+    let all = |which: usize| {
+        placed
+            .iter()
+            .filter_map(|p| p.ratio(which))
+            .collect::<Vec<_>>()
+    };
     let mut found = Vec::new();
     if may(Known::Odometry) {
         let track: Vec<(Rigid, Rigid)> = placed
@@ -373,7 +382,11 @@ mod tests {
         let height = height_above_floor(&depth, &lens, 1).unwrap();
         assert!((height - 1.4).abs() < 0.01, "{height}");
         let wall = flat(80, 60, |_, _| 3.0);
-        assert_eq!(height_above_floor(&wall, &lens, 1), None, "a wall is no floor");
+        assert_eq!(
+            height_above_floor(&wall, &lens, 1),
+            None,
+            "a wall is no floor"
+        );
         assert_eq!(height_above_floor(&DepthMap::none(), &lens, 1), None);
     }
 }

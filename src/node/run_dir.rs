@@ -20,7 +20,7 @@ use crate::eval::health::write_health;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
-use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing};
+use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing};
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
 use crate::frame::RgbImage;

@@ -7,8 +7,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::clock::Stamp;
-use crate::ros::{self, CameraInfo, CompressedImage, Image, Message as _, PoseStamped, TfMessage};
 use crate::ros::odometry::Odometry;
+use crate::ros::{self, CameraInfo, CompressedImage, Image, Message as _, PoseStamped, TfMessage};
 use crate::source::bag::{Bag, Message};
 use crate::source::calibration::lens_of_camera_info;
 use crate::source::truth::{Track, Transforms};
@@ -140,7 +140,8 @@ impl Survey {
             TfMessage::TYPE_NAME => {
                 if let Ok(transforms) = ros::decode::<TfMessage>(message.payload) {
                     let is_static = channel.topic.ends_with("tf_static");
-                    self.has_left_out |= !Arc::make_mut(&mut self.transforms).insert(&transforms, is_static);
+                    self.has_left_out |=
+                        !Arc::make_mut(&mut self.transforms).insert(&transforms, is_static);
                 }
             }
             _ => {}

@@ -134,7 +134,7 @@ impl Odometry {
                 camera_frame,
             } => {
                 let chain = transforms.chain(camera_frame, ODOM_FRAME)?;
-                transforms.along(&chain, |track| track.between(stamp))
+                Transforms::along(&chain, |track| track.between(stamp))
             }
         }
     }
@@ -212,11 +212,11 @@ impl Transforms {
         let chain = WORLD_FRAMES
             .iter()
             .find_map(|world| self.chain(camera_frame, world))?;
-        self.along(&chain, |track| track.nearest(stamp, within_nanos))
+        Self::along(&chain, |track| track.nearest(stamp, within_nanos))
     }
 
     /// The transform up a chain; moving links are asked for their own.
-    fn along(&self, chain: &[&Link], moving: impl Fn(&Track) -> Option<Rigid>) -> Option<Rigid> {
+    fn along(chain: &[&Link], moving: impl Fn(&Track) -> Option<Rigid>) -> Option<Rigid> {
         let mut top_from_child = Rigid::IDENTITY;
         for link in chain {
             let parent_from_child = if link.is_static {
@@ -237,7 +237,7 @@ impl Transforms {
     /// How the camera is mounted: links of a robot's body, which never move.
     pub(super) fn fixed(&self, parent: &str, child: &str) -> Option<Rigid> {
         let chain = self.chain(child, parent.trim_start_matches('/'))?;
-        self.along(&chain, |_| None)
+        Self::along(&chain, |_| None)
     }
 
     /// Links from the camera up to `world`.

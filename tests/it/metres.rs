@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use splat_mapper::config::SourceParams;
 use splat_mapper::config::Settings;
+use splat_mapper::config::SourceParams;
 use splat_mapper::map::snapshot::{Scale, ScaleSource};
 use splat_mapper::source::open;
 use splat_mapper::source::synthetic::record::write_recording;
@@ -36,7 +36,16 @@ fn replayed(bag: &Path, out: &Path, sets: &[&str]) -> (serde_json::Value, f64) {
         String::from_utf8(output.stdout).unwrap()
     };
     let (bag, out) = (bag.to_str().unwrap(), out.to_str().unwrap());
-    let mut args = vec!["replay", bag, "--out", out, "--geometry", "sfm", "--steps", "1"];
+    let mut args = vec![
+        "replay",
+        bag,
+        "--out",
+        out,
+        "--geometry",
+        "sfm",
+        "--steps",
+        "1",
+    ];
     sets.iter().for_each(|set| args.extend(["--set", set]));
     run(&args);
     let report = std::fs::read_to_string(format!("{out}/report.json")).unwrap();
@@ -67,7 +76,11 @@ fn a_recording_with_odometry_or_depth_has_a_map_in_metres() {
         let (wheels, exact) = (step(|f| f.odometry.unwrap()), step(|f| f.truth.unwrap()));
         assert!((wheels - exact).abs() < 0.1 * exact, "{wheels} {exact}");
     }
-    for (known, source) in [("odometry", "odometry"), ("depth", "depth"), ("off", "up_to_scale")] {
+    for (known, source) in [
+        ("odometry", "odometry"),
+        ("depth", "depth"),
+        ("off", "up_to_scale"),
+    ] {
         let out = folder.path().join(known);
         let (scale, exact) = replayed(&bag, &out, &[&format!("scale.known={known}")]);
         assert_eq!(scale["source"], source);
@@ -78,12 +91,20 @@ fn a_recording_with_odometry_or_depth_has_a_map_in_metres() {
         let (off, std) = ((metres / exact - 1.0).abs(), scale["std"].as_f64().unwrap());
         eprintln!("{known}: {metres:.4} +- {std:.4} m a unit, {exact:.4} by the true poses");
         assert!(off < MAX_SCALE_ERROR, "{known}: {metres} for {exact}");
-        assert!(std > 0.0 && off < 4.0 * std / metres, "{known}: {off} {std}");
+        assert!(
+            std > 0.0 && off < 4.0 * std / metres,
+            "{known}: {off} {std}"
+        );
     }
     // The distance between the first and a later keyframe, measured.
     let out = folder.path().join("baseline");
-    let metres = (frames[20].truth.unwrap().translation - frames[0].truth.unwrap().translation).length();
-    let sets = ["scale.known=baseline", &format!("scale.baseline={metres}"), "scale.baseline_to=2"];
+    let metres =
+        (frames[20].truth.unwrap().translation - frames[0].truth.unwrap().translation).length();
+    let sets = [
+        "scale.known=baseline",
+        &format!("scale.baseline={metres}"),
+        "scale.baseline_to=2",
+    ];
     let (scale, exact) = replayed(&bag, &out, &sets);
     assert_eq!(scale["source"], "baseline");
     let found = scale["metres_per_unit"].as_f64().unwrap();
@@ -104,7 +125,12 @@ fn scale_survives_files_and_messages_or_is_refused() {
     for kept in [scale, Scale::GIVEN, Scale::UP_TO_SCALE] {
         assert_eq!(Scale::of_numbers(kept.to_numbers()), Some(kept));
     }
-    for bad in [(6, 1.0, 0.0), (2, f64::NAN, 0.0), (2, -1.0, 0.0), (2, 1.0, f64::INFINITY)] {
+    for bad in [
+        (6, 1.0, 0.0),
+        (2, f64::NAN, 0.0),
+        (2, -1.0, 0.0),
+        (2, 1.0, f64::INFINITY),
+    ] {
         assert_eq!(Scale::of_numbers(bad), None);
     }
 }

@@ -4,9 +4,7 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 use splat_mapper::config::Settings;
-use splat_mapper::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing,
-};
+use splat_mapper::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing};
 use splat_mapper::map::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.

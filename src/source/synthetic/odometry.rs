@@ -14,10 +14,7 @@ const STREAM: u64 = 0x0d0_3e7e;
 /// How the camera is mounted on the base (REP-103: x forward, y left, z up): ahead of the axle and above, looking forward.
 pub(super) fn base_from_cam() -> Rigid {
     let looks_forward = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
-    Rigid::new(
-        DQuat::from_mat3(&looks_forward),
-        DVec3::new(0.25, 0.0, 0.6),
-    )
+    Rigid::new(DQuat::from_mat3(&looks_forward), DVec3::new(0.25, 0.0, 0.6))
 }
 
 /// `odom_from_base` at every frame; the length of each step and its turn are off by `noise` (a normal share). Starts at the

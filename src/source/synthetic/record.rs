@@ -17,12 +17,12 @@ use serde::Serialize;
 use crate::atomic::write_file;
 use crate::camera::{Distortion, Lens};
 use crate::frame::DepthMap;
+use crate::pose::Rigid;
+use crate::ros::odometry::Odometry;
 use crate::ros::{
     self, CameraInfo, CompressedImage, Header, Image, Message, Pose, PoseStamped, TfMessage,
     TransformStamped,
 };
-use crate::pose::Rigid;
-use crate::ros::odometry::Odometry;
 
 use super::odometry;
 use super::take::Take;
