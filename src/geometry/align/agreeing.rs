@@ -19,6 +19,8 @@ const MAX_DEPTH_ERRORS: f64 = 5.0;
 pub(super) struct Agreeing {
     pub(super) track: Track,
     pub(super) point: DVec3,
+    /// Sights, less each by the square of its misfit (0 to 1): more and closer ones score higher.
+    pub(super) score: f64,
 }
 
 /// `limits`: px, and the relative error that depth is expected to have.
@@ -61,7 +63,12 @@ fn of_track(
             .enumerate()
             .max_by(|a, b| a.1.total_cmp(b.1))?;
         if *most <= 1.0 {
-            return Some(Agreeing { track, point });
+            let score = misfits.iter().map(|m| 1.0 - m * m).sum();
+            return Some(Agreeing {
+                track,
+                point,
+                score,
+            });
         }
         track.remove(worst);
     }

@@ -117,11 +117,11 @@ impl Whole {
         let mut matched = matcher.matched_anew(&views, params.max_matches);
         let tracks = covering_tracks(&matched, TRACKS_PER_VIEW);
         let limit = MAX_POINT_ERROR_PX * longest_px(&matched) / 640.0;
-        let n_agreeing = |matched: &Matched| {
+        let score = |matched: &Matched| {
             let found = agreeing(matched, &tracks, &depths, (limit, params.depth_error));
-            found.iter().map(|a| a.track.len()).sum::<usize>()
+            found.iter().map(|a| a.score).sum::<f64>()
         };
-        let before = n_agreeing(&matched);
+        let before = score(&matched);
         adjust_all(
             &views,
             &mut matched,
@@ -129,7 +129,7 @@ impl Whole {
             params.depth_error,
             given,
         );
-        let after = n_agreeing(&matched);
+        let after = score(&matched);
         tracing::debug!(
             component,
             n = views.len(),
@@ -138,7 +138,7 @@ impl Whole {
             after,
             "whole"
         );
-        if after < before {
+        if after <= before {
             return None;
         }
         super::write_back(&mut views, &matched);
