@@ -60,5 +60,6 @@ mod steps;
 mod synthetic;
 mod synthetic_source;
 mod topics;
+mod tracking;
 mod trajectory;
 mod xfeat;
