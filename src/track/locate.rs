@@ -48,6 +48,8 @@ pub(super) struct Located {
     pub(super) covariance: Matrix6<f64>,
     pub(super) design: f64,
     pub(super) n_inliers: usize,
+    /// Of the landmarks that the keyframe with most of them has in view.
+    pub(super) share: f64,
     /// The keyframe with most of the inliers.
     pub(super) reference: u32,
 }
@@ -70,7 +72,10 @@ impl Tracker {
         if let Some(guess) = hint.map(|motion| motion.ahead(seen.stamp)) {
             for radius in [NARROW, WIDE] {
                 match self.around(&guess, radius, frame, &self.tracking_gates()) {
-                    Ok(located) => return Ok((located, false)),
+                    Ok(located) if self.is_plausible(seen, &located) => {
+                        return Ok((located, false));
+                    }
+                    Ok(_) => failure = Reason::Implausible,
                     Err(reason) => failure = reason,
                 }
             }
@@ -82,6 +87,16 @@ impl Tracker {
         let ids = self.candidates(seen);
         let located = self.search(&ids, frame, &self.search_gates());
         located.map(|located| (located, true)).ok_or(failure)
+    }
+
+    /// Whether the motion before could have led there; what could not must be as clear as if there had been none.
+    fn is_plausible(&self, seen: &Seen, located: &Located) -> bool {
+        let motion = self.motion.as_ref();
+        let is_far = motion
+            .is_some_and(|motion| self.is_elsewhere(motion, seen.stamp, &located.cam_from_map));
+        let gates = self.search_gates();
+        let is_clear = located.n_inliers >= gates.min_inliers && located.share >= gates.min_share;
+        !is_far || is_clear
     }
 
     /// The pose of an earlier frame, which the map has reached since, from a guess or the keyframes next to it in time.
@@ -254,6 +269,7 @@ impl Tracker {
             covariance: fit.covariance,
             design: fit.design,
             n_inliers: found,
+            share: found as f64 / most.max(1) as f64,
             reference,
         })
     }

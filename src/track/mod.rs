@@ -32,6 +32,8 @@ use crate::pose::Rigid;
 /// Design effect before one was seen, and the share that each frame has in the mean: some 50 frames.
 const FIRST_DESIGN: f64 = 2.0;
 const DESIGN_SHARE: f64 = 0.02;
+/// Part of the time to the next frame by which a loss is declared early, so that a camera of 4 Hz says it in time as well.
+const LOOK_AHEAD: f64 = 0.7;
 /// Design effects of single frames beyond it are outliers.
 const MAX_DESIGN: f64 = 25.0;
 
@@ -66,6 +68,8 @@ pub enum Reason {
     Inexact { times: f64 },
     #[error("the landmarks leave the pose open")]
     Open,
+    #[error("the motion so far cannot have led to where the landmarks say")]
+    Implausible,
     #[error("no keyframe is recognised")]
     NotRecognised,
 }
@@ -121,6 +125,8 @@ pub struct Tracker {
     anchor: Option<Anchor>,
     /// Frames without a measured pose since the last one with.
     n_failed: usize,
+    /// Of the frame before.
+    last_stamp: Option<Stamp>,
     design: f64,
     /// Where among the keyframes the search goes on.
     searched: usize,
@@ -139,6 +145,7 @@ impl Tracker {
             motion: None,
             anchor: None,
             n_failed: 0,
+            last_stamp: None,
             design: FIRST_DESIGN,
             searched: 0,
             waiting: VecDeque::new(),
@@ -158,6 +165,7 @@ impl Tracker {
             Ok((located, by_search)) => self.found(&seen, &located, by_search),
             Err(reason) => self.missed(&seen, reason),
         };
+        self.last_stamp = Some(seen.stamp);
         let anchor = self.anchor.filter(|_| tracked.is_measured());
         let history_ix = self.history.push(&tracked, anchor);
         self.waiting.push_back(Waiting { seen, history_ix });
@@ -274,8 +282,10 @@ impl Tracker {
             .motion
             .as_ref()
             .map(|motion| seen.stamp.secs_since(motion.stamp));
+        let last = self.last_stamp.unwrap_or(seen.stamp);
+        let wait = seen.stamp.secs_since(last) * LOOK_AHEAD;
         // A keyframe that is gone leaves no motion, but a tracker that was somewhere.
-        let is_late = since.is_none_or(|secs| secs >= self.params.lost_secs);
+        let is_late = since.is_none_or(|secs| secs + wait >= self.params.lost_secs);
         if self.state != State::Initialising && self.state != State::Lost {
             self.state = if is_late {
                 State::Lost

@@ -52,7 +52,7 @@ impl Motion {
             return self.cam_from_map;
         };
         let share = (stamp.secs_since(self.stamp) / secs).clamp(0.0, MAX_AHEAD);
-        let turn = step.rotation.to_scaled_axis() * share;
+        let turn = turn_of(step) * share;
         let next = Rigid::exp(DVec3::ZERO, turn) * self.cam_from_map;
         Rigid::new(next.rotation, next.translation + step.translation * share).renormalized()
     }
@@ -61,7 +61,7 @@ impl Motion {
     pub(super) fn covariance_ahead(&self, stamp: Stamp, scene_depth: f64) -> Matrix6<f64> {
         let secs = stamp.secs_since(self.stamp).max(0.0);
         let (speed, turn_rate) = self.step.as_ref().map_or((0.0, 0.0), |(step, secs)| {
-            let turn = step.rotation.to_scaled_axis().length();
+            let turn = turn_of(step).length();
             (step.translation.length() / secs, turn / secs)
         });
         let far = speed.max(MIN_SPEED_DEPTHS * scene_depth) * secs;
@@ -90,6 +90,17 @@ impl Motion {
     }
 }
 
+/// Axis times angle, the short way round: a quaternion and its negative are one rotation.
+fn turn_of(step: &Rigid) -> DVec3 {
+    let rotation = step.rotation;
+    let short = if rotation.w < 0.0 {
+        -rotation
+    } else {
+        rotation
+    };
+    short.to_scaled_axis()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -110,6 +121,11 @@ mod tests {
         let wanted = step * step * first;
         assert!((next.translation - wanted.translation).length() < 3e-3);
         assert!(next.angle_to(&wanted) < 1e-9);
+        // The same camera, written with the opposite quaternion.
+        let mut negative = step * first;
+        negative.rotation = -negative.rotation;
+        let motion = Motion::on(Some(&before), at(1.1), negative, zero);
+        assert!(motion.ahead(at(1.15)).angle_to(&motion.ahead(at(1.2))) < 0.02);
         assert_eq!(motion.ahead(at(2.0)), motion.ahead(at(9.0)));
         assert_eq!(
             motion.ahead(at(0.5)).translation,

@@ -61,5 +61,6 @@ mod synthetic;
 mod synthetic_source;
 mod topics;
 mod tracking;
+mod tracking_node;
 mod trajectory;
 mod xfeat;

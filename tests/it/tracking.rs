@@ -14,9 +14,9 @@ use splat_mapper::pose::Rigid;
 use splat_mapper::source;
 use splat_mapper::track::{KeyframeView, State, TrackedFrame, Tracker};
 
-/// 10 Hz; a round takes 6 s.
-const ROOM: &str = "synthetic:room?frames=60&width=320&height=240&speed=2";
-const FACADE: &str = "synthetic:facade?frames=6&width=320&height=240&speed=2";
+/// 10 Hz, at most 2 deg from frame to frame.
+const ROOM: &str = "synthetic:room?frames=60&width=320&height=240&speed=0.5";
+const FACADE: &str = "synthetic:facade?frames=6&width=320&height=240&speed=0.5";
 const KEYFRAME_EVERY: usize = 4;
 /// Shares of the depth of the scene, and degrees: half a pixel of 320 is 0.1 deg.
 const MAX_SHIFT: f64 = 0.01;
@@ -105,20 +105,20 @@ fn every_frame_is_tracked_by_keyframes_that_come_late() {
     let mut tracker = Tracker::new(&params());
     let mut right = 0;
     for (i, frame) in frames.iter().enumerate() {
-        // Keyframes get their pose when the camera has gone three keyframes further.
+        // Keyframes get their pose when the camera has gone two keyframes further.
         if i % KEYFRAME_EVERY == 0 {
-            let known = (i / KEYFRAME_EVERY).saturating_sub(2).min(all.len());
+            let known = (i / KEYFRAME_EVERY).saturating_sub(1).min(all.len());
             tracker.update(&all[..known]);
         }
         let tracked = tracker.track(frame);
-        if i >= 3 * KEYFRAME_EVERY {
+        if i >= 2 * KEYFRAME_EVERY {
             assert_eq!(tracked.state, State::Tracking, "{i}: {:?}", tracked.reason);
             right += usize::from(is_right(&tracked, frame));
         } else {
             assert_eq!((tracked.state, tracked.pose), (State::Initialising, None));
         }
     }
-    assert!(right >= 46, "{right} of 48");
+    assert!(right >= 50, "{right} of 52");
 }
 
 #[test]
@@ -190,8 +190,9 @@ fn a_kidnapped_camera_is_noticed_and_never_said_to_be_where_it_is_not() {
         if tracked.is_measured() {
             assert!(
                 is_right(&tracked, frame),
-                "{i}: {:?}",
-                error(&tracked, frame)
+                "{i}: {:?}, {} inliers",
+                error(&tracked, frame),
+                tracked.n_inliers
             );
         }
         if matches!(tracked.state, State::Lost | State::Relocalised) {
@@ -285,7 +286,12 @@ fn noisy_depth(depth: &DepthMap, rng: &mut Pcg32) -> DepthMap {
 fn nees(tracked: &TrackedFrame, frame: &Frame) -> f64 {
     let pose = tracked.pose.unwrap();
     let off = pose.map_from_cam.inverse() * frame.truth.unwrap();
-    let (rho, theta) = (off.translation, off.rotation.to_scaled_axis());
+    let short = if off.rotation.w < 0.0 {
+        -off.rotation
+    } else {
+        off.rotation
+    };
+    let (rho, theta) = (off.translation, short.to_scaled_axis());
     let error = Vector6::new(rho.x, rho.y, rho.z, theta.x, theta.y, theta.z);
     let covariance = Matrix6::from_fn(|i, j| pose.covariance[i][j]);
     error.dot(&(covariance.try_inverse().unwrap() * error))
@@ -293,13 +299,14 @@ fn nees(tracked: &TrackedFrame, frame: &Frame) -> f64 {
 
 /// 95 % of chi squared with six degrees of freedom lies between these.
 const BAND: (f64, f64) = (1.24, 14.45);
+const N_RUNS: u64 = 5;
 
 #[test]
 fn stated_covariances_cover_the_errors() {
     let frames = &room()[..40];
     let (mut inside, mut all, mut sum) = (0, 0, 0.0);
-    let mut by_run = Vec::new();
-    for seed in 0..8 {
+    let mut runs_inside = 0;
+    for seed in 0..N_RUNS {
         let mut rng = Pcg32::seed_from_u64(seed);
         let mut views = views(frames);
         for view in &mut views {
@@ -322,13 +329,21 @@ fn stated_covariances_cover_the_errors() {
                 (sum, of_run, n, all) = (sum + value, of_run + value, n + 1, all + 1);
             }
         }
-        by_run.push(of_run / f64::from(n));
+        // The mean of n frames, were they independent; those that share a keyframe are not quite.
+        let n = f64::from(n);
+        runs_inside += usize::from((of_run / n - 6.0).abs() < 1.96 * (12.0 / n).sqrt());
     }
     let (share, mean) = (inside as f64 / all as f64, sum / all as f64);
-    eprintln!("NEES {mean:.2} of 6, {share:.3} in the band, by run {by_run:.1?}");
+    eprintln!(
+        "NEES {mean:.2} of 6, {share:.3} of frames and {runs_inside} of {N_RUNS} runs in the band"
+    );
     assert!(
-        share >= 0.85 && (2.0..9.0).contains(&mean),
-        "{share} {mean} {by_run:?}"
+        share >= 0.85 && (3.0..8.0).contains(&mean),
+        "{share} {mean}"
+    );
+    assert!(
+        runs_inside * 10 >= N_RUNS as usize * 8,
+        "{runs_inside} of {N_RUNS}"
     );
 }
 
