@@ -2,6 +2,7 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod localise;
 pub mod pipeline;
 pub mod run_dir;
 mod stages;

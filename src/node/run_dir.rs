@@ -147,6 +147,7 @@ fn write(
         snapshot: (**snapshot).clone(),
         seed: report.seed,
         steps: outcome.map.n_steps(),
+        landmarks: std::mem::take(&mut outcome.tracking.landmarks),
     };
     let results: [anyhow::Result<()>; 9] = [
         write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),

@@ -41,6 +41,8 @@ pub(super) struct TrackStage {
 #[derive(Debug, Default)]
 pub struct Tracking {
     pub tracks: Tracks,
+    /// What a later run needs to find its place in the map; empty without tracking.
+    pub landmarks: Vec<u8>,
     /// Live: frames that made room for newer ones before they were tracked.
     pub n_dropped: u64,
     /// Seconds of work, in all and per frame.
@@ -104,8 +106,14 @@ impl TrackStage {
 
     pub(super) fn finish(mut self, n_dropped: u64) -> Tracking {
         let watch = Stopwatch::start();
+        let saved = self.tracker.as_ref().map(Tracker::saved);
+        let landmarks = saved.unwrap_or_else(|| Ok(Vec::new()));
         let tracks = self.tracker.take().map(Tracker::finish);
         Tracking {
+            landmarks: landmarks.unwrap_or_else(|reason| {
+                tracing::warn!("later runs will not find their place in this map: {reason}");
+                Vec::new()
+            }),
             tracks: tracks.unwrap_or_default(),
             n_dropped,
             secs: self.secs + watch.secs(),

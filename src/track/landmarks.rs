@@ -52,9 +52,9 @@ pub(super) struct Held {
     pub(super) landmarks: Vec<Landmark>,
     /// How often the present unit of its depths goes into that of its first ones.
     pub(super) unit: f64,
-    depth: Weak<DepthMap>,
+    pub(super) depth: Weak<DepthMap>,
     /// Corner number and depth of the landmarks.
-    depths: Vec<(u32, f32)>,
+    pub(super) depths: Vec<(u32, f32)>,
 }
 
 /// All keyframes that can be tracked by.

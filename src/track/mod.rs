@@ -8,6 +8,7 @@ mod history;
 mod landmarks;
 mod locate;
 mod motion;
+mod saved;
 mod search;
 mod seen;
 

@@ -11,6 +11,7 @@ use crate::geometry::scale_space::Grey;
 
 /// Size of a thumbnail.
 const THUMBNAIL: (usize, usize) = (32, 24);
+pub(super) const THUMBNAIL_LEN: usize = THUMBNAIL.0 * THUMBNAIL.1;
 /// Below this standard deviation, of 1 = black to white, a thumbnail is blank and like no other.
 const MIN_CONTRAST: f32 = 0.01;
 /// Sigma of a corner of the finest level, as `features::orb` states it.
@@ -33,7 +34,7 @@ pub(super) struct Seen {
     /// Levels are 1.2 apart; 1 for the finest.
     pub(super) levels: Vec<f32>,
     pub(super) bits: Vec<[u64; 4]>,
-    thumbnail: Vec<f32>,
+    pub(super) thumbnail: Vec<f32>,
 }
 
 /// The camera behind a working picture.

@@ -28,6 +28,7 @@ mod html;
 mod known;
 mod layers;
 mod lenses;
+mod localise;
 mod lpips;
 mod mcmc;
 mod moves;
