@@ -8,6 +8,7 @@ mod file;
 pub mod onnx;
 mod range;
 pub mod scale;
+pub mod track;
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -68,6 +69,7 @@ pub struct Params {
     pub mvs: MvsParams,
     pub align: AlignParams,
     pub onnx: onnx::OnnxParams,
+    pub track: track::TrackParams,
     pub map: MapParams,
     pub scale: scale::ScaleParams,
     pub eval: EvalParams,
@@ -299,9 +301,8 @@ impl Settings {
         })?;
         let mut values = BTreeMap::new();
         flatten("", &tree, &mut values);
-        values
-            .into_iter()
-            .try_for_each(|(key, value)| self.set(&key, value))
+        let mut changes = values.into_iter();
+        changes.try_for_each(|(key, value)| self.set(&key, value))
     }
 
     /// Applies one `key=value` of the command line; the value is YAML.

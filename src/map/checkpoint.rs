@@ -30,6 +30,7 @@ const MAX_SECTIONS: u32 = 64;
 const META: [u8; 4] = *b"META";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
 const SPLATS: [u8; 4] = *b"SPLT";
+const LANDMARKS: [u8; 4] = *b"LAND";
 
 /// Bytes of one keyframe: id, stamp, quaternion, translation, picture size, focal lengths, principal point.
 const KEYFRAME_BYTES: usize = 4 + 8 + 4 * 8 + 3 * 8 + 2 * 4 + 4 * 8;
@@ -41,6 +42,8 @@ pub struct Checkpoint {
     pub seed: u64,
     /// Optimiser updates made so far.
     pub steps: u64,
+    /// Landmarks by which a later run finds its place, as `track::Tracker` saves them; empty where there are none.
+    pub landmarks: Vec<u8>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +67,7 @@ pub fn write(checkpoint: &Checkpoint, path: &Path) -> Result<(), CheckpointError
         (META, meta_bytes(checkpoint)),
         (KEYFRAMES, keyframe_bytes(&snapshot.poses)),
         (SPLATS, splat_bytes(&snapshot.splats)),
+        (LANDMARKS, checkpoint.landmarks.clone()),
     ];
     crate::atomic::write_file(path, |file| {
         let mut header = Vec::with_capacity(FILE_HEADER_BYTES as usize);
@@ -110,7 +114,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     }
     let n_sections = read_header(&mut file, path)?;
     let mut remaining_bytes = file_info.len() - FILE_HEADER_BYTES;
-    let (mut meta, mut keyframes, mut splats) = (None, None, None);
+    let (mut meta, mut keyframes, mut splats, mut landmarks) = (None, None, None, None);
     for section_ix in 0..n_sections {
         let (tag, content) = match read_section(&mut file, &mut remaining_bytes) {
             Ok(Ok(section)) => section,
@@ -121,6 +125,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
             META => fill_once(&mut meta, parse_meta(&content)),
             KEYFRAMES => fill_once(&mut keyframes, parse_keyframes(&content)),
             SPLATS => fill_once(&mut splats, parse_splats(&content)),
+            LANDMARKS => fill_once(&mut landmarks, Ok(content)),
             _ => Ok(()),
         };
         known.map_err(|reason| damaged(format!("section {}: {reason}", tag.escape_ascii())))?;
@@ -144,6 +149,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
         },
         seed: meta.seed,
         steps: meta.steps,
+        landmarks: landmarks.unwrap_or_default(),
     })
 }
 

@@ -18,6 +18,7 @@ pub mod schedule;
 pub mod seed;
 pub mod snapshot;
 mod transient;
+mod views;
 
 use std::sync::Arc;
 

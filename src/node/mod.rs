@@ -2,9 +2,11 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod localise;
 pub mod pipeline;
 pub mod run_dir;
 mod stages;
+pub mod track_stage;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -25,6 +27,7 @@ use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
 use crate::map::snapshot::{Scale, Snapshot};
 use crate::node::pipeline::Subscriber;
+use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
@@ -82,6 +85,7 @@ pub struct StageSecs {
     pub decode: f64,
     pub geometry: f64,
     pub optimise: f64,
+    pub track: f64,
 }
 
 /// What a run leaves behind.
@@ -93,6 +97,8 @@ pub struct Outcome {
     pub n_selected: usize,
     /// Stamps of all frames that arrived, in order.
     pub frame_stamps: Vec<Stamp>,
+    /// Poses of all frames that the tracker saw.
+    pub tracking: Tracking,
     /// Ground truth of the keyframes, where the recording has it.
     pub truth: Vec<(Stamp, Rigid)>,
     pub secs: StageSecs,

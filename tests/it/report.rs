@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use serde_json::Value;
 use splat_mapper::config::Settings;
-use splat_mapper::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing};
+use splat_mapper::eval::report::{
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
+};
 use splat_mapper::map::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.
@@ -19,6 +21,8 @@ geometry_note
 keyframes.components
 keyframes.registered
 keyframes.selected
+latency_ms.frame_to_pose_p50
+latency_ms.frame_to_pose_p95
 latency_ms.keyframe_to_pose_p50
 latency_ms.keyframe_to_pose_p95
 latency_ms.keyframe_to_snapshot_p50
@@ -43,7 +47,17 @@ steps_per_s
 timing_s.decode
 timing_s.geometry
 timing_s.optimise
+timing_s.track
 timing_s.wall
+tracking.dropped
+tracking.frames
+tracking.interpolated
+tracking.lost
+tracking.posed
+tracking.relocalised
+tracking.tracked
+tracking.work_ms_p50
+tracking.work_ms_p95
 version";
 
 pub(crate) fn sample_report() -> Report {
@@ -72,9 +86,15 @@ pub(crate) fn sample_report() -> Report {
             decode: 1.9,
             geometry: 61.4,
             optimise: 96.0,
+            track: 2.6,
         },
         steps_per_s: Some(12.5),
-        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0]),
+        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0], &[0.012, 0.02]),
+        tracking: TrackingFigures {
+            frames: 50,
+            tracked: 47,
+            ..TrackingFigures::default()
+        },
         peak_rss_mib: Some(731.4),
         peak_gpu_mib: None,
         quality: Quality {
