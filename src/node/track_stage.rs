@@ -16,7 +16,7 @@ const MAX_FRAMES_WITHOUT_NEWS: usize = 10;
 /// What the tracker hears, in order.
 pub(super) enum Heard {
     /// A frame, and the time since it came.
-    Frame(Frame, Stopwatch),
+    Frame(Box<Frame>, Stopwatch),
     /// Replay: the keyframes of one more batch must have their place before the next frame is tracked, so that what
     /// a frame is tracked by does not hang on how fast the threads are.
     Batch,
@@ -159,7 +159,7 @@ pub(super) fn policies(is_live: bool) -> (WhenFull, WhenFull) {
 pub(super) fn tell(heard: Option<&Sender<Heard>>, frame: &Frame) {
     if let Some(heard) = heard {
         // A tracker that is gone is no reason to stop mapping.
-        drop(heard.send(Heard::Frame(frame.clone(), Stopwatch::start())));
+        drop(heard.send(Heard::Frame(Box::new(frame.clone()), Stopwatch::start())));
     }
 }
 
