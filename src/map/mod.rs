@@ -114,13 +114,6 @@ impl SplatMap {
         }
     }
 
-    /// From now on looks for metres by these parameters, unless the geometry has them.
-    #[must_use]
-    pub fn measuring_scale(mut self, params: &ScaleParams) -> Self {
-        self.scale_params = Some(params.clone());
-        self
-    }
-
     /// Adds what the model says of a batch; `progress` is the share of the input that has come, where known.
     /// Returns the ids of the keyframes that are in the map since.
     pub fn add(
