@@ -15,6 +15,7 @@ use crate::camera::{Distortion, Intrinsics, Lens};
 use crate::clock::Stamp;
 use crate::config::track::TrackParams;
 use crate::pose::Rigid;
+use crate::ros;
 
 /// More than any map has.
 const MAX_KEYFRAMES: usize = 1_000_000;
@@ -70,14 +71,12 @@ impl Tracker {
     /// What a later run needs to find its place.
     pub fn saved(&self) -> Result<Vec<u8>, String> {
         let keyframes = self.landmarks.held.values().map(Keyframe::of).collect();
-        cdr_encoding::to_vec::<_, byteorder::LittleEndian>(&Saved { keyframes })
-            .map_err(|e| e.to_string())
+        ros::to_cdr(&Saved { keyframes }).map_err(|e| e.to_string())
     }
 
     /// A tracker in a map that was saved; it begins without any idea of where it is.
     pub fn in_saved(bytes: &[u8], params: &TrackParams) -> Result<Self, String> {
-        let (saved, _) = cdr_encoding::from_bytes::<Saved, byteorder::LittleEndian>(bytes)
-            .map_err(|e| format!("landmarks do not decode: {e}"))?;
+        let saved: Saved = ros::from_cdr(bytes).map_err(|e| e.to_string())?;
         if saved.keyframes.len() > MAX_KEYFRAMES {
             return Err(format!("landmarks of {} keyframes", saved.keyframes.len()));
         }
