@@ -23,13 +23,15 @@ const EXACT: f64 = 0.015;
 /// Pictures with fewer corners show nothing: black, white, a blank wall.
 const MIN_CORNERS: usize = 30;
 /// Landmarks that agree, as a share of those that the keyframe with most of them has in view.
-const MIN_SHARE: f64 = 0.08;
-const MIN_SHARE_SEARCHED: f64 = 0.15;
+const MIN_SHARE: f64 = 0.1;
+const MIN_SHARE_SEARCHED: f64 = 0.18;
+/// Of the pairs that were looked for where the pose puts them; a pose that half of them contradict is that of another place.
+const MIN_SHARE_OF_PAIRS: f64 = 0.5;
 /// Least standard deviation of the inliers over the picture, across where they spread most, share of the longer side;
 /// an even spread over a picture of 4:3 has 0.22.
 const MIN_SPREAD: f64 = 0.05;
 /// Residuals that are larger by so much are those of another place.
-const MAX_SCALE: f64 = 3.0;
+const MAX_SCALE: f64 = 2.5;
 /// A pose that is known no better says nothing: share of the depth of the scene, and radians.
 const MAX_STD_DEPTHS: f64 = 0.05;
 const MAX_STD_RAD: f64 = 0.05;
@@ -103,11 +105,11 @@ impl Tracker {
     pub(super) fn find_again(&self, seen: &Arc<Seen>, guess: Option<Rigid>) -> Option<Located> {
         let straight = self.straightened(seen).ok()?;
         let frame = (&**seen, &straight);
-        let gates = self.tracking_gates();
-        let radii: &[f64] = if guess.is_some() {
-            &[NARROW]
+        // Where nothing was measured before, what is found must be as clear as what a search finds.
+        let (radii, gates): (&[f64], Gates) = if guess.is_some() {
+            (&[NARROW], self.tracking_gates())
         } else {
-            &[NARROW, WIDE]
+            (&[NARROW, WIDE], self.search_gates())
         };
         let start = guess
             .map(|pose| pose.inverse())
@@ -116,7 +118,7 @@ impl Tracker {
             let mut tries = radii.iter();
             tries.find_map(|radius| self.around(&start, *radius, frame, &gates).ok())
         });
-        near.or_else(|| self.search(&self.beside(seen), frame, &gates))
+        near.or_else(|| self.search(&self.beside(seen), frame, &self.search_gates()))
     }
 
     /// `cam_from_map` halfway between the keyframes on both sides.
@@ -243,9 +245,9 @@ impl Tracker {
     ) -> Result<Located, Reason> {
         let pinhole = &straight.camera.pinhole;
         let longest = f64::from(pinhole.width_px.max(pinhole.height_px));
-        let needed = gates
-            .min_inliers
-            .max((gates.min_share * most as f64) as usize);
+        let of_seen = (gates.min_share * most as f64) as usize;
+        let of_pairs = (MIN_SHARE_OF_PAIRS * pairs.sights.len() as f64) as usize;
+        let needed = gates.min_inliers.max(of_seen).max(of_pairs);
         let found = fit.inliers.len();
         if found < needed {
             return Err(Reason::TooFew { found, needed });
