@@ -89,7 +89,7 @@ pub(crate) fn sample_report() -> Report {
             track: 2.6,
         },
         steps_per_s: Some(12.5),
-        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0], &[0.012, 0.02]),
+        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0], &[0.0125, 0.0125]),
         tracking: TrackingFigures {
             frames: 50,
             tracked: 47,

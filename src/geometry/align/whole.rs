@@ -44,7 +44,8 @@ const HELD_SHARE: usize = 8;
 pub(super) struct Whole {
     /// With a grid of depths each, and the depth of each feature.
     views: BTreeMap<u32, (View, Vec<Option<f64>>)>,
-    /// Keyframes at the last correction, by component.
+    /// By component: keyframes that came so far, and those that had come before the last correction.
+    n_added: BTreeMap<u32, usize>,
     n_corrected: BTreeMap<u32, usize>,
     /// Component of which keyframes were forgotten.
     cut: Option<u32>,
@@ -70,6 +71,7 @@ impl Whole {
                 ..view.clone()
             };
             self.views.insert(view.keyframe_id, (thumbnail, depths));
+            *self.n_added.entry(view.component).or_default() += 1;
         }
         self.is_uncalibrated |= !given.is_calibrated;
         while self.views.len() > max {
@@ -79,8 +81,8 @@ impl Whole {
 
     /// Whether so much is new that a component should be corrected.
     pub(super) fn is_due(&self, component: u32) -> bool {
-        let (n, before) = (self.n_of(component), self.n_before(component));
-        n >= before + MIN_GROWTH.max((before as f64 * GROWTH) as usize)
+        let enough = (self.n_of(component) as f64 * GROWTH / (1.0 + GROWTH)) as usize;
+        self.n_new(component) >= MIN_GROWTH.max(enough)
     }
 
     /// Components in which anything is new.
@@ -88,7 +90,7 @@ impl Whole {
         let mut components: Vec<u32> = self.views.values().map(|(v, _)| v.component).collect();
         components.sort_unstable();
         components.dedup();
-        components.retain(|&c| self.n_of(c) != self.n_before(c));
+        components.retain(|&c| self.n_new(c) > 0);
         components
     }
 
@@ -105,7 +107,8 @@ impl Whole {
             .filter(|(v, _)| v.component == component)
             .cloned()
             .unzip();
-        self.n_corrected.insert(component, views.len());
+        let n_added = self.n_added.get(&component).copied().unwrap_or(0);
+        self.n_corrected.insert(component, n_added);
         if views.len() < MIN_VIEWS {
             return None;
         }
@@ -167,8 +170,10 @@ impl Whole {
         own.count()
     }
 
-    fn n_before(&self, component: u32) -> usize {
-        self.n_corrected.get(&component).copied().unwrap_or(0)
+    /// Keyframes that came since the last correction.
+    fn n_new(&self, component: u32) -> usize {
+        let count = |counts: &BTreeMap<u32, usize>| counts.get(&component).copied().unwrap_or(0);
+        count(&self.n_added) - count(&self.n_corrected)
     }
 }
 
