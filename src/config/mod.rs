@@ -5,6 +5,7 @@
 
 pub mod align;
 mod file;
+mod known;
 pub mod onnx;
 mod range;
 pub mod scale;
@@ -17,6 +18,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::Value;
 
+pub use self::known::KnownParams;
 use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
 use crate::config::range::{Range, ranges_of_comments};
@@ -112,22 +114,6 @@ pub struct SelectParams {
     pub max_wait: f64,
     pub batch_size: usize,
     pub batch_overlap: usize,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct KnownParams {
-    pub rotation_noise_deg: f64,
-    pub translation_noise: f64,
-    pub translation_noise_extent: f64,
-    pub drift_deg: f64,
-    pub drift_extent: f64,
-    pub offset_deg: f64,
-    pub offset_extent: f64,
-    pub depth_noise: f64,
-    pub windows: bool,
-    pub window_scale: f64,
-    pub depth_outliers: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
