@@ -99,7 +99,7 @@ fn a_model_that_knows_the_truth_maps_the_demo_as_known_poses_do() {
     assert!((ratio - 1.0).abs() < 0.02, "{ratio}");
     let psnr = |report: &Value| report["quality"]["psnr_train"].as_f64().unwrap();
     assert!((psnr(&report) - psnr(&known)).abs() < 0.3);
-    assert_eq!(report["scale"]["source"], "up_to_scale");
+    assert_eq!(report["scale"]["source"], "depth");
     assert!(
         report["geometry_note"].is_null(),
         "{}",

@@ -126,7 +126,7 @@ fn structure_from_motion_finds_the_room_from_pictures_alone() {
     let wide = "synthetic:room?frames=16&width=480&height=360&speed=2";
     let output = replay(wide, folder.path(), &["--steps", "40"]);
     assert!(output.status.success(), "{}", last_line(&output));
-    assert_eq!(report(folder.path())["scale"]["source"], "up_to_scale");
+    assert_eq!(report(folder.path())["scale"]["source"], "depth");
     let truth = replay(
         wide,
         &folder.path().join("known"),
