@@ -16,8 +16,8 @@ use super::zncc::{NOISE_VARIANCE, WINDOW, integer};
 
 /// Relative difference of depth that is a jump.
 pub(super) const JUMP: f32 = 0.04;
-/// Reach of the matching window: pixels further from a jump are none of its business.
-const REACH: usize = WINDOW / 2;
+/// Reach of the matching window and a pixel more, for smoothness: pixels further from a jump are none of its business.
+const REACH: usize = WINDOW / 2 + 1;
 const RADIUS: usize = 2;
 const SIDE: usize = 2 * RADIUS + 1;
 /// A luma difference at which a neighbour counts 1/e.

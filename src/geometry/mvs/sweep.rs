@@ -1,7 +1,9 @@
 //! Reference and source pictures -> matching cost of each pixel on each plane of a sweep.
 //!
-//! Planes are parallel to the reference picture. A cost is 1 - ZNCC over a square window, averaged over the two
-//! sources that match best: a point hidden from some sources is still seen by two.
+//! Planes are parallel to the reference picture. A cost is 1 - score, averaged over the two sources that match
+//! best: a point hidden from some sources is still seen by two. A score is the ZNCC over a square window and, for a
+//! smaller part, how like the two pixels in its middle are (compare Mei et al., ICCV workshops 2011): a window beside
+//! the edge of a thing matches at the depth of the thing, the pixel in its middle need not.
 
 use rayon::prelude::*;
 
