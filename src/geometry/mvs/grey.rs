@@ -19,8 +19,23 @@ const MAX_CELLS: usize = 1 << 27;
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
 impl Grey {
-    /// A picture whose pixels do not fit its size counts as empty.
+    /// At the size of the depth map.
     pub(super) fn of_image(image: &RgbImage, params: &MvsParams) -> Self {
+        let (width, height) = (image.width_px as usize, image.height_px as usize);
+        Self::resized(image, working_size(width, height, params))
+    }
+
+    /// Of the same picture twice the size of this, as far as the picture has it; without colours.
+    pub(super) fn finer(&self, image: &RgbImage) -> Self {
+        let width = (2 * self.width).min(image.width_px as usize);
+        let height = (2 * self.height).min(image.height_px as usize);
+        let mut finer = Self::resized(image, (width, height));
+        finer.colours = Vec::new();
+        finer
+    }
+
+    /// A picture whose pixels do not fit its size counts as empty.
+    fn resized(image: &RgbImage, (width, height): (usize, usize)) -> Self {
         let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
         let fits = from_width
             .checked_mul(from_height)
@@ -34,7 +49,6 @@ impl Grey {
                 colours: Vec::new(),
             };
         }
-        let (width, height) = working_size(from_width, from_height, params);
         let columns = shares(from_width, width);
         let rows = shares(from_height, height);
         let mut sums = vec![[0.0_f32; 3]; width];

@@ -22,6 +22,7 @@ const MIN_TRAVEL_PX: f64 = 1.5;
 #[derive(Debug)]
 pub(super) struct Warp<'a> {
     pub(super) source: &'a Grey,
+    pub(super) fine: &'a Grey,
     /// Columns for x, y and 1. Pixel index space on both sides: centres at integers.
     pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
@@ -44,6 +45,7 @@ impl<'a> Warp<'a> {
         let corner = glam::DVec3::new((0.5 - from.cx) / from.fx, (0.5 - from.cy) / from.fy, 1.0);
         let warp = Self {
             source: &source.grey,
+            fine: &source.fine,
             pixel_map: [
                 project(rotation.x_axis / from.fx),
                 project(rotation.y_axis / from.fy),
