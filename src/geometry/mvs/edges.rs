@@ -234,3 +234,28 @@ fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES]
         above + (below - above) * share_y[k]
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn beyond_the_border_the_outermost_pixels_go_on() {
+        let columns = (0..64).map(|ix| (ix % 8) as f32);
+        let grey = Grey {
+            width: 8,
+            height: 8,
+            values: columns.collect(),
+            colours: Vec::new(),
+        };
+        for (corner, row) in [
+            (-2.0, [0.0, 0.0, 0.0, 1.0, 2.0]),
+            (5.0, [5.0, 6.0, 7.0, 7.0, 7.0]),
+        ] {
+            let seen = sampled(&grey, Vec2::splat(corner), Vec2::X, Vec2::Y);
+            for k in 0..SIDE * SIDE {
+                assert_eq!(seen[k], row[k % SIDE], "{corner} {k}");
+            }
+        }
+    }
+}

@@ -125,3 +125,29 @@ fn shares(from: usize, into: usize) -> Vec<Share> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_finer_picture_shows_the_same_at_up_to_twice_the_size() {
+        let (width_px, height_px) = (32, 24);
+        let pixels = (0..3 * width_px * height_px).map(|ix| (ix * 37 % 251) as u8);
+        let image = RgbImage {
+            width_px,
+            height_px,
+            pixels: pixels.collect(),
+        };
+        let grey = Grey::resized(&image, (8, 6));
+        let finer = grey.finer(&image);
+        assert_eq!((finer.width, finer.height), (16, 12));
+        for (ix, value) in grey.values.iter().enumerate() {
+            let (x, y) = (2 * (ix % 8), 2 * (ix / 8));
+            let four = [finer.row(y), finer.row(y + 1)].map(|row| row[x] + row[x + 1]);
+            assert!((value - (four[0] + four[1]) / 4.0).abs() < 1e-5, "{ix}");
+        }
+        let full = Grey::resized(&image, (32, 24));
+        assert_eq!(full.finer(&image).values, full.values);
+    }
+}
