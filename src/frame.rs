@@ -134,7 +134,9 @@ pub struct Frame {
     pub intrinsics: Option<Intrinsics>,
     /// Ground truth where the source has it (`world_from_cam`, OpenCV axes). Only `geometry::known` and `eval` may look.
     pub truth: Option<Rigid>,
-    /// Exact depth where the source has it (synthetic scenes and their recordings), at image size or smaller.
+    /// `odom_from_cam` in metres, where the source has odometry: its steps are right, its places drift.
+    pub odometry: Option<Rigid>,
+    /// Depth in metres by something that measures it (exact in synthetic scenes), at image size or smaller.
     pub truth_depth: Option<Arc<DepthMap>>,
     /// The source keeps it for measuring quality: it gets a place in the map, but no optimiser step learns from it.
     pub is_held_out: bool,

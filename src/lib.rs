@@ -34,6 +34,8 @@ pub mod gpu;
 
 pub mod geometry;
 
+pub mod track;
+
 pub mod splat;
 
 pub mod map;

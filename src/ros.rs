@@ -3,6 +3,8 @@
 //! Field order is the wire order of the ROS 2 Jazzy interface packages. A payload starts with the four byte
 //! encapsulation header, which says little (CDR_LE) or big endian (CDR_BE). Knows nothing of files or networks.
 
+pub mod odometry;
+
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -68,6 +70,24 @@ pub fn encode<T: Message + Serialize>(message: &T) -> Result<Vec<u8>, CdrError> 
     payload.extend_from_slice(&[0, 1, 0, 0]);
     payload.extend_from_slice(&body);
     Ok(payload)
+}
+
+/// Data of our own as little-endian CDR without header.
+pub fn to_cdr<T: Serialize>(data: &T) -> Result<Vec<u8>, CdrError> {
+    cdr_encoding::to_vec::<T, byteorder::LittleEndian>(data).map_err(|e| CdrError::Encode {
+        type_name: std::any::type_name::<T>(),
+        reason: e.to_string(),
+    })
+}
+
+/// What `to_cdr` wrote. Lists grow as their content is read, never by a number that only claims it.
+pub fn from_cdr<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CdrError> {
+    cdr_encoding::from_bytes::<T, byteorder::LittleEndian>(bytes)
+        .map(|(data, _)| data)
+        .map_err(|e| CdrError::Decode {
+            type_name: std::any::type_name::<T>(),
+            reason: e.to_string(),
+        })
 }
 
 /// `builtin_interfaces/msg/Time`.

@@ -7,9 +7,10 @@ use std::process::ExitCode;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::cli::{ParamArgs, ReplayArgs, RunArgs, Usage, say};
+use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
+use crate::node::localise;
 use crate::node::pipeline::{self, Subscriber};
 use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
 use crate::source;
@@ -54,6 +55,37 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         }
     }
     map(&settings, &args.input, args.out.as_deref())
+}
+
+pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
+    let params = settings(&args.params)?.params().map_err(|e| usage(&e))?;
+    if let Some(out) = &args.out {
+        run_dir::prepare(out)?;
+    }
+    run_dir::start_log(args.out.as_deref(), std::io::stderr().is_terminal())?;
+    let mut source = source::open(&args.input, &params.source, params.seed)?;
+    let stop = Stop::default();
+    stop_on_ctrl_c(&stop)?;
+    let out = args.out.as_deref();
+    let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
+    if args.json {
+        say(serde_json::to_string_pretty(&found)?);
+    } else {
+        say(format!(
+            "{} of {} frames found among {} keyframes, {} times lost, {} times found again",
+            found.tracked, found.frames, found.map_keyframes, found.lost, found.relocalised
+        ));
+    }
+    if found.tracked == 0 {
+        let reason = found
+            .reason
+            .unwrap_or_else(|| "there are no frames".to_owned());
+        anyhow::bail!(
+            "the camera was not found in the map: {reason}; it must see what the map was made of, in similar light: {}",
+            args.input
+        );
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
 pub(super) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {

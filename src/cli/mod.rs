@@ -23,6 +23,9 @@ enum Command {
     Run(RunArgs),
     /// Maps a recording or a folder of images and writes a run directory
     Replay(ReplayArgs),
+    /// Finds the camera in a map of an earlier run, frame by frame, and leaves the map as it is
+    #[command(alias = "localize")]
+    Localise(LocaliseArgs),
     /// Renders a recording with exact poses and depth
     Synth(SynthArgs),
     /// Compares the keyframes of a run with reference poses
@@ -93,6 +96,23 @@ struct ReplayArgs {
     /// Keeps every N-th keyframe out of optimisation to measure quality; 0 = off
     #[arg(long, value_name = "N")]
     holdout: Option<u32>,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
+#[derive(Debug, Args)]
+struct LocaliseArgs {
+    /// map.splatmap of an earlier run
+    map: PathBuf,
+    /// MCAP file, rosbag2 folder, image folder or source URI
+    #[arg(value_name = "BAG_OR_DIR")]
+    input: String,
+    /// Folder for trajectory.tum, frames.csv and localisation.json
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Prints JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -190,6 +210,7 @@ pub fn main() -> ExitCode {
     let result = match cli.command {
         Command::Run(args) => mapping::run(&args),
         Command::Replay(args) => mapping::replay(&args),
+        Command::Localise(args) => mapping::localise(&args),
         Command::Synth(args) => commands::synth(&args),
         Command::Eval(args) => commands::eval(&args),
         Command::Render(args) => commands::render(&args),

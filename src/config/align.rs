@@ -29,6 +29,7 @@ pub struct AlignParams {
     pub depth_error: f64,
     pub join: JoinBy,
     pub history: usize,
+    pub whole: usize,
     pub min_inliers: f64,
     pub max_scale_jump: f64,
     pub max_turn_deg: f64,

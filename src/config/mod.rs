@@ -7,6 +7,8 @@ pub mod align;
 mod file;
 pub mod onnx;
 mod range;
+pub mod scale;
+pub mod track;
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -67,7 +69,9 @@ pub struct Params {
     pub mvs: MvsParams,
     pub align: AlignParams,
     pub onnx: onnx::OnnxParams,
+    pub track: track::TrackParams,
     pub map: MapParams,
+    pub scale: scale::ScaleParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
 }
@@ -87,6 +91,7 @@ pub struct SourceParams {
     pub camera_info_topic: String,
     pub pose_topic: String,
     pub depth_topic: String,
+    pub odometry_topic: String,
     pub names: String,
     pub held_out_names: String,
     pub pick: usize,
@@ -296,9 +301,8 @@ impl Settings {
         })?;
         let mut values = BTreeMap::new();
         flatten("", &tree, &mut values);
-        values
-            .into_iter()
-            .try_for_each(|(key, value)| self.set(&key, value))
+        let mut changes = values.into_iter();
+        changes.try_for_each(|(key, value)| self.set(&key, value))
     }
 
     /// Applies one `key=value` of the command line; the value is YAML.

@@ -8,6 +8,7 @@ pub mod comparisons;
 pub mod doctor;
 pub mod evaluation;
 pub mod figures;
+pub mod frames;
 pub mod health;
 pub mod html;
 pub mod image_metrics;

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{EvalError, read_text, write_atomically};
-use crate::map::snapshot::ScaleSource;
+use crate::map::snapshot;
 use crate::source::SourceCounts;
 
 const MAX_FILE_BYTES: u64 = 1 << 26;
@@ -29,6 +29,8 @@ pub struct Report {
     pub timing_s: Timing,
     pub steps_per_s: Option<f64>,
     pub latency_ms: Latency,
+    #[serde(default)]
+    pub tracking: TrackingFigures,
     pub peak_rss_mib: Option<f64>,
     pub peak_gpu_mib: Option<f64>,
     pub quality: Quality,
@@ -75,15 +77,42 @@ pub struct Timing {
     pub geometry: f64,
     #[serde(deserialize_with = "null_as_nan")]
     pub optimise: f64,
+    #[serde(default, deserialize_with = "null_as_nan")]
+    pub track: f64,
 }
 
-/// From the arrival of a keyframe to its pose, and to the first snapshot that holds it.
+/// From the arrival of a keyframe to its pose, and to the first snapshot that holds it; live, from the arrival of any frame
+/// to its pose by the tracker.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Latency {
     pub keyframe_to_pose_p50: Option<f64>,
     pub keyframe_to_pose_p95: Option<f64>,
     pub keyframe_to_snapshot_p50: Option<f64>,
     pub keyframe_to_snapshot_p95: Option<f64>,
+    #[serde(default)]
+    pub frame_to_pose_p50: Option<f64>,
+    #[serde(default)]
+    pub frame_to_pose_p95: Option<f64>,
+}
+
+/// Poses of single frames.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct TrackingFigures {
+    /// That came to the tracker, and those that had to make room for newer ones before.
+    pub frames: u64,
+    pub dropped: u64,
+    /// With a pose measured when they came.
+    pub tracked: u64,
+    /// With a measured pose in `trajectory.tum`: keyframes, tracked ones and those that the map has reached since.
+    pub posed: u64,
+    /// With a pose between two measured ones.
+    pub interpolated: u64,
+    /// Times that the tracker got lost, and was found again without a hint.
+    pub lost: u64,
+    pub relocalised: u64,
+    /// Milliseconds of work per frame.
+    pub work_ms_p50: Option<f64>,
+    pub work_ms_p95: Option<f64>,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -139,38 +168,37 @@ impl FrameCounts {
 }
 
 impl Latency {
-    /// From one measurement, in seconds, per keyframe.
-    pub fn of(keyframe_to_pose_secs: &[f64], keyframe_to_snapshot_secs: &[f64]) -> Self {
+    /// From one measurement, in seconds, per keyframe and per frame.
+    pub fn of(
+        keyframe_to_pose_secs: &[f64],
+        keyframe_to_snapshot_secs: &[f64],
+        frame_to_pose_secs: &[f64],
+    ) -> Self {
         let ms = |values: &[f64], share: f64| percentile(values, share).map(|secs| secs * 1e3);
         Self {
             keyframe_to_pose_p50: ms(keyframe_to_pose_secs, 0.5),
             keyframe_to_pose_p95: ms(keyframe_to_pose_secs, 0.95),
             keyframe_to_snapshot_p50: ms(keyframe_to_snapshot_secs, 0.5),
             keyframe_to_snapshot_p95: ms(keyframe_to_snapshot_secs, 0.95),
+            frame_to_pose_p50: ms(frame_to_pose_secs, 0.5),
+            frame_to_pose_p95: ms(frame_to_pose_secs, 0.95),
         }
     }
 }
 
-impl Scale {
-    pub fn of(source: ScaleSource) -> Self {
-        match source {
-            ScaleSource::UpToScale => Self {
-                source: "up_to_scale".to_owned(),
-                metres_per_unit: None,
-                std: None,
-            },
-            ScaleSource::Given => Self {
-                source: "given".to_owned(),
-                metres_per_unit: Some(1.0),
-                std: None,
-            },
+impl From<snapshot::Scale> for Scale {
+    fn from(scale: snapshot::Scale) -> Self {
+        Self {
+            source: scale.source.name().to_owned(),
+            metres_per_unit: scale.metres_per_unit,
+            std: scale.std,
         }
     }
 }
 
 impl Default for Scale {
     fn default() -> Self {
-        Self::of(ScaleSource::UpToScale)
+        snapshot::Scale::UP_TO_SCALE.into()
     }
 }
 

@@ -100,6 +100,7 @@ impl Known {
         Ok(GeometryBatch {
             batch_id: batch.id,
             views: joined.views,
+            revised: joined.revised,
             note: joined.note,
             ..GeometryBatch::default()
         })
@@ -226,8 +227,11 @@ impl GeometryModel for Known {
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
-        if self.aligner.is_some() {
-            return Ok(GeometryBatch::default());
+        if let Some(aligner) = &mut self.aligner {
+            return Ok(GeometryBatch {
+                revised: aligner.finish(),
+                ..GeometryBatch::default()
+            });
         }
         let mut answer = self.stereo.finish();
         answer.views = answer.views.into_iter().map(|v| self.disturb(v)).collect();

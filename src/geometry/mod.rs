@@ -116,6 +116,22 @@ pub struct GeometryBatch {
     pub note: Option<String>,
 }
 
+impl GeometryBatch {
+    /// Adds later news: of views of this batch, which take it over, and of others.
+    pub fn revise(&mut self, revised: impl IntoIterator<Item = Revision>) {
+        for news in revised {
+            let id = news.keyframe_id;
+            if let Some(view) = self.views.iter_mut().find(|v| v.keyframe_id == id) {
+                (view.batch_from_cam, view.intrinsics) = (news.batch_from_cam, news.intrinsics);
+            } else if let Some(old) = self.revised.iter_mut().find(|r| r.keyframe_id == id) {
+                *old = news;
+            } else {
+                self.revised.push(news);
+            }
+        }
+    }
+}
+
 #[derive(Debug, thiserror::Error)]
 pub enum GeometryError {
     #[error("{model} needs {needs} for keyframe {keyframe_id}, found none; {way_out}")]

@@ -117,7 +117,7 @@ pub fn refine(
 }
 
 /// Rows du/dxi and dv/dxi for `exp(xi) * p`, translation first.
-fn jacobian(camera: &Intrinsics, p: DVec3) -> [Vector6<f64>; 2] {
+pub fn jacobian(camera: &Intrinsics, p: DVec3) -> [Vector6<f64>; 2] {
     let (x, y, iz) = (p.x / p.z, p.y / p.z, 1.0 / p.z);
     let (fx, fy) = (camera.fx, camera.fy);
     [

@@ -14,7 +14,7 @@ use glam::{DQuat, DVec3};
 use crate::camera::Intrinsics;
 use crate::clock::Stamp;
 use crate::map::layout;
-use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::pose::Rigid;
 use crate::splat::Splats;
 
@@ -30,6 +30,7 @@ const MAX_SECTIONS: u32 = 64;
 const META: [u8; 4] = *b"META";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
 const SPLATS: [u8; 4] = *b"SPLT";
+const LANDMARKS: [u8; 4] = *b"LAND";
 
 /// Bytes of one keyframe: id, stamp, quaternion, translation, picture size, focal lengths, principal point.
 const KEYFRAME_BYTES: usize = 4 + 8 + 4 * 8 + 3 * 8 + 2 * 4 + 4 * 8;
@@ -41,6 +42,8 @@ pub struct Checkpoint {
     pub seed: u64,
     /// Optimiser updates made so far.
     pub steps: u64,
+    /// Landmarks by which a later run finds its place, as `track::Tracker` saves them; empty where there are none.
+    pub landmarks: Vec<u8>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +67,7 @@ pub fn write(checkpoint: &Checkpoint, path: &Path) -> Result<(), CheckpointError
         (META, meta_bytes(checkpoint)),
         (KEYFRAMES, keyframe_bytes(&snapshot.poses)),
         (SPLATS, splat_bytes(&snapshot.splats)),
+        (LANDMARKS, checkpoint.landmarks.clone()),
     ];
     crate::atomic::write_file(path, |file| {
         let mut header = Vec::with_capacity(FILE_HEADER_BYTES as usize);
@@ -110,7 +114,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     }
     let n_sections = read_header(&mut file, path)?;
     let mut remaining_bytes = file_info.len() - FILE_HEADER_BYTES;
-    let (mut meta, mut keyframes, mut splats) = (None, None, None);
+    let (mut meta, mut keyframes, mut splats, mut landmarks) = (None, None, None, None);
     for section_ix in 0..n_sections {
         let (tag, content) = match read_section(&mut file, &mut remaining_bytes) {
             Ok(Ok(section)) => section,
@@ -121,6 +125,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
             META => fill_once(&mut meta, parse_meta(&content)),
             KEYFRAMES => fill_once(&mut keyframes, parse_keyframes(&content)),
             SPLATS => fill_once(&mut splats, parse_splats(&content)),
+            LANDMARKS => fill_once(&mut landmarks, Ok(content)),
             _ => Ok(()),
         };
         known.map_err(|reason| damaged(format!("section {}: {reason}", tag.escape_ascii())))?;
@@ -144,6 +149,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
         },
         seed: meta.seed,
         steps: meta.steps,
+        landmarks: landmarks.unwrap_or_default(),
     })
 }
 
@@ -155,7 +161,7 @@ struct Meta {
     stamp: Stamp,
     seed: u64,
     steps: u64,
-    scale: ScaleSource,
+    scale: Scale,
 }
 
 /// Checks the file header; returns the number of sections.
@@ -244,13 +250,16 @@ fn meta_bytes(checkpoint: &Checkpoint) -> Vec<u8> {
     bytes.extend_from_slice(&snapshot.stamp.nanos.to_le_bytes());
     bytes.extend_from_slice(&checkpoint.seed.to_le_bytes());
     bytes.extend_from_slice(&checkpoint.steps.to_le_bytes());
-    bytes.push(snapshot.scale.code());
+    let (code, metres, std) = snapshot.scale.to_numbers();
+    bytes.push(code);
+    bytes.extend_from_slice(&metres.to_le_bytes());
+    bytes.extend_from_slice(&std.to_le_bytes());
     bytes
 }
 
 fn parse_meta(content: &[u8]) -> Result<Meta, String> {
     let mut rest = content;
-    let mut parse = || -> io::Result<(Meta, u8)> {
+    let mut parse = || -> io::Result<(Meta, (u8, f64, f64))> {
         let mut map_id = [0; 16];
         rest.read_exact(&mut map_id)?;
         let meta = Meta {
@@ -260,13 +269,25 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
             stamp: Stamp::from_nanos(rest.read_i64::<LittleEndian>()?),
             seed: rest.read_u64::<LittleEndian>()?,
             steps: rest.read_u64::<LittleEndian>()?,
-            scale: ScaleSource::default(),
+            scale: Scale::UP_TO_SCALE,
         };
-        Ok((meta, rest.read_u8()?))
+        let code = rest.read_u8()?;
+        // Files of before scale was measured end here; what was given then was metres.
+        if rest.is_empty() {
+            let metres = if code == Scale::GIVEN.source.code() {
+                1.0
+            } else {
+                0.0
+            };
+            return Ok((meta, (code, metres, 0.0)));
+        }
+        let metres = rest.read_f64::<LittleEndian>()?;
+        Ok((meta, (code, metres, rest.read_f64::<LittleEndian>()?)))
     };
-    let (meta, code) = parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
-    let scale =
-        ScaleSource::from_code(code).ok_or_else(|| format!("scale source {code} is unknown"))?;
+    let (meta, numbers) =
+        parse().map_err(|e| format!("{} bytes are too few: {e}", content.len()))?;
+    let scale = Scale::of_numbers(numbers)
+        .ok_or_else(|| format!("scale (source, metres, deviation) {numbers:?} is none"))?;
     Ok(Meta { scale, ..meta })
 }
 

@@ -23,7 +23,7 @@ const MIN_ALPHA: f32 = 0.8;
 impl SplatMap {
     /// Fits the depth of new views to the map, where the model's lengths are relative.
     pub(super) fn fit_depths(&mut self) {
-        if self.scale != ScaleSource::UpToScale || self.engine.n_splats() == 0 {
+        if self.scale.source == ScaleSource::Given || self.engine.n_splats() == 0 {
             return;
         }
         let map_poses = self.engine.poses();

@@ -28,6 +28,9 @@ pub struct Placed {
     /// What the map made of the model's depth, and how often it was asked.
     pub depth_factor: f64,
     pub n_depth_looks: u8,
+    /// Logarithms of metres per unit of the model's depth, by depth pictures and by the floor; `None` before it was
+    /// looked at.
+    pub ratios: Option<[Option<f64>; 2]>,
     pub health: Health,
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,

@@ -12,11 +12,13 @@ mod held_out;
 pub mod keyframes;
 pub mod layout;
 mod matches;
+mod metric;
 mod revise;
 pub mod schedule;
 pub mod seed;
 pub mod snapshot;
 mod transient;
+mod views;
 
 use std::sync::Arc;
 
@@ -25,12 +27,13 @@ use rand_pcg::Pcg64Mcg;
 use sha2::{Digest, Sha256};
 
 use crate::config::MapParams;
+use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
-use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::splat::{Engine, PoseStep, StepSettings, TrainingView};
 
 /// Keyframes without a pose that are kept in case the model places them later.
@@ -63,7 +66,8 @@ pub struct SplatMap {
     n_put_back: u64,
     /// Share of the input that has come, while more is to come and where it is known.
     progress: Option<f64>,
-    scale: ScaleSource,
+    scale: Scale,
+    scale_params: Option<ScaleParams>,
     seed: u64,
     epoch: u32,
     revision: u32,
@@ -85,7 +89,7 @@ impl std::fmt::Debug for SplatMap {
 }
 
 impl SplatMap {
-    pub fn new(params: MapParams, seed: u64, scale: ScaleSource, engine: Box<dyn Engine>) -> Self {
+    pub fn new(params: MapParams, seed: u64, scale: Scale, engine: Box<dyn Engine>) -> Self {
         Self {
             params,
             engine,
@@ -100,6 +104,7 @@ impl SplatMap {
             n_put_back: 0,
             progress: None,
             scale,
+            scale_params: None,
             seed,
             epoch: 0,
             revision: 0,
@@ -193,6 +198,7 @@ impl SplatMap {
                 intrinsics: placed.intrinsics.refocused(focal_factor),
             })
             .collect();
+        self.scale = self.measure_scale(&poses);
         self.revision += 1;
         Arc::new(Snapshot {
             map_id: self.map_id(),
@@ -307,6 +313,7 @@ impl SplatMap {
                     self.engine
                         .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
                     (placed.depth, placed.median_depth) = (depth, median_depth);
+                    placed.ratios = None;
                 }
                 placed.health = view.health;
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
@@ -339,6 +346,7 @@ impl SplatMap {
                         median_depth,
                         depth_factor: 1.0,
                         n_depth_looks: 0,
+                        ratios: None,
                         health: view.health,
                         is_held_out,
                     },

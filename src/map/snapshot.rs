@@ -15,21 +15,97 @@ pub enum ScaleSource {
     UpToScale,
     /// Poses given in metres by the recording (`--geometry known`).
     Given,
+    /// Steps of the wheels, or of whatever else counts them.
+    Odometry,
+    /// Pictures of a depth camera.
+    Depth,
+    /// How high the camera stands over the floor.
+    Height,
+    /// A distance between two places of the camera that somebody measured.
+    Baseline,
 }
 
 impl ScaleSource {
+    const ALL: [Self; 6] = [
+        Self::UpToScale,
+        Self::Given,
+        Self::Odometry,
+        Self::Depth,
+        Self::Height,
+        Self::Baseline,
+    ];
+
+    /// As reports have it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::UpToScale => "up_to_scale",
+            Self::Given => "given",
+            Self::Odometry => "odometry",
+            Self::Depth => "depth",
+            Self::Height => "camera_height",
+            Self::Baseline => "baseline",
+        }
+    }
+
     /// Number in files and messages.
     pub fn code(self) -> u8 {
         match self {
             Self::UpToScale => 0,
             Self::Given => 1,
+            Self::Odometry => 2,
+            Self::Depth => 3,
+            Self::Height => 4,
+            Self::Baseline => 5,
         }
     }
 
     pub fn from_code(code: u8) -> Option<Self> {
-        [Self::UpToScale, Self::Given]
-            .into_iter()
-            .find(|source| source.code() == code)
+        Self::ALL.into_iter().find(|source| source.code() == code)
+    }
+}
+
+/// Metres of one unit of the map.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Scale {
+    pub source: ScaleSource,
+    /// `None` while only ratios are known.
+    pub metres_per_unit: Option<f64>,
+    /// Standard deviation of `metres_per_unit`, where known.
+    pub std: Option<f64>,
+}
+
+impl Scale {
+    pub const UP_TO_SCALE: Self = Self {
+        source: ScaleSource::UpToScale,
+        metres_per_unit: None,
+        std: None,
+    };
+    pub const GIVEN: Self = Self {
+        source: ScaleSource::Given,
+        metres_per_unit: Some(1.0),
+        std: None,
+    };
+
+    /// As messages and files have it: code, metres and standard deviation, 0 where unknown.
+    pub fn to_numbers(self) -> (u8, f64, f64) {
+        let known = |value: Option<f64>| value.unwrap_or(0.0);
+        (
+            self.source.code(),
+            known(self.metres_per_unit),
+            known(self.std),
+        )
+    }
+
+    /// `None` where the code is unknown or a number is none.
+    pub fn of_numbers((code, metres, std): (u8, f64, f64)) -> Option<Self> {
+        let source = ScaleSource::from_code(code)?;
+        let known = |value: f64| (value > 0.0).then_some(value);
+        let is_sound = metres.is_finite() && std.is_finite() && metres >= 0.0 && std >= 0.0;
+        is_sound.then_some(Self {
+            source,
+            metres_per_unit: known(metres),
+            std: known(std),
+        })
     }
 }
 
@@ -52,7 +128,7 @@ pub struct Snapshot {
     pub revision: u32,
     /// Stamp of the newest keyframe in the map.
     pub stamp: Stamp,
-    pub scale: ScaleSource,
+    pub scale: Scale,
     /// In order of keyframe id.
     pub poses: Vec<KeyframePose>,
     pub splats: Arc<Splats>,

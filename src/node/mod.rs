@@ -2,9 +2,11 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod localise;
 pub mod pipeline;
 pub mod run_dir;
 mod stages;
+pub mod track_stage;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,8 +25,9 @@ use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
-use crate::map::snapshot::{ScaleSource, Snapshot};
+use crate::map::snapshot::{Scale, Snapshot};
 use crate::node::pipeline::Subscriber;
+use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
@@ -82,6 +85,7 @@ pub struct StageSecs {
     pub decode: f64,
     pub geometry: f64,
     pub optimise: f64,
+    pub track: f64,
 }
 
 /// What a run leaves behind.
@@ -93,6 +97,8 @@ pub struct Outcome {
     pub n_selected: usize,
     /// Stamps of all frames that arrived, in order.
     pub frame_stamps: Vec<Stamp>,
+    /// Poses of all frames that the tracker saw.
+    pub tracking: Tracking,
     /// Ground truth of the keyframes, where the recording has it.
     pub truth: Vec<(Stamp, Rigid)>,
     pub secs: StageSecs,
@@ -123,11 +129,11 @@ impl std::fmt::Debug for Outcome {
 fn model(
     params: &Params,
     truth_extent: Option<f64>,
-) -> anyhow::Result<(Box<dyn GeometryModel>, ScaleSource)> {
+) -> anyhow::Result<(Box<dyn GeometryModel>, Scale)> {
     match params.geometry.as_str() {
         "sfm" => Ok((
             Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
-            ScaleSource::UpToScale,
+            Scale::UP_TO_SCALE,
         )),
         "known" => {
             let known = Known::new(
@@ -138,9 +144,9 @@ fn model(
             )?;
             // Windows have units of their own, as a foundation model's have.
             let scale = if params.known.windows {
-                ScaleSource::UpToScale
+                Scale::UP_TO_SCALE
             } else {
-                ScaleSource::Given
+                Scale::GIVEN
             };
             let known = known.in_windows(&params.align, &params.sfm)?;
             Ok((Box::new(known), scale))
@@ -150,7 +156,7 @@ fn model(
                 let network = Model::open(Path::new(file), &params.onnx)?;
                 let aligner = Aligner::new(&params.align, &params.sfm, params.seed)?;
                 let foundation = Foundation::of(network, &params.onnx, aligner);
-                Ok((Box::new(foundation), ScaleSource::UpToScale))
+                Ok((Box::new(foundation), Scale::UP_TO_SCALE))
             }
             None => bail!("{name:?} is no geometry; expected sfm, known or onnx:FILE"),
         },

@@ -10,12 +10,17 @@ use crate::geometry::{GeometryBatch, GeometryError};
 use crate::map::SplatMap;
 use crate::map::snapshot::Snapshot;
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
+use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
 use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
 use crate::queue::{Ended, Receiver, Sender, WhenFull, queue};
 use crate::source::SourceCounts;
 
 /// Frames between source and selection.
 const FRAME_QUEUE: usize = 4;
+/// Frames before the tracker: live, an older one is worth nothing once two newer ones are there.
+const HEARD_QUEUE: usize = 2;
+/// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
+const NEWS_SECS: f64 = 1.0;
 
 /// What crosses from geometry to the map; no batch at the model's end.
 type Answer = (Option<Arc<Batch>>, GeometryBatch);
@@ -41,11 +46,13 @@ pub fn run(
         job.params.seed,
         scale,
         engine(job.params.backend, job.params.deterministic)?,
-    );
+    )
+    .measuring_scale(&job.params.scale);
     let stages = Stages {
         map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
         select: SelectStage::new(&job.params),
         geometry: GeometryStage::new(model),
+        track: TrackStage::new(&job.params.track, job.is_live),
         source: SourceStage::new(job.source, job.stop),
         subscriber,
     };
@@ -64,6 +71,7 @@ struct Stages {
     select: SelectStage,
     geometry: GeometryStage,
     map: MapStage,
+    track: TrackStage,
     subscriber: Option<Box<dyn Subscriber>>,
 }
 
@@ -75,6 +83,7 @@ struct End {
     select: SelectStage,
     geometry: GeometryStage,
     map: MapStage,
+    tracking: Tracking,
     snapshot: Arc<Snapshot>,
     subscriber: Option<Box<dyn Subscriber>>,
     error: Option<String>,
@@ -91,9 +100,13 @@ impl Stages {
             on_progress(progress);
         };
         let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
-        let mut map_batch = |batch: Batch| -> Result<(), GeometryError> {
+        let track = &mut self.track;
+        let mut map_batch = |batch: Batch, track: &mut TrackStage| -> Result<(), GeometryError> {
             let answer = geometry.infer(&batch)?;
             map.add(Some(&batch), answer, &mut publish);
+            if track.is_on() {
+                track.update(&map.map.keyframe_views());
+            }
             Ok(())
         };
         let mut result = Ok(());
@@ -101,10 +114,15 @@ impl Stages {
             let Some(frame) = self.source.next() else {
                 break;
             };
-            result = select.push(frame).map_or(Ok(()), &mut map_batch);
+            track.track(&frame, &Stopwatch::start());
+            if let Some(batch) = select.push(frame) {
+                result = map_batch(batch, track);
+            }
         }
-        if result.is_ok() {
-            result = select.finish().map_or(Ok(()), &mut map_batch);
+        if result.is_ok()
+            && let Some(batch) = select.finish()
+        {
+            result = map_batch(batch, track);
         }
         let result = result.and_then(|()| {
             let rest = geometry.finish()?;
@@ -112,7 +130,9 @@ impl Stages {
             Ok(())
         });
         let snapshot = map.finish(&mut publish);
+        track.update(&map.map.keyframe_views());
         End {
+            tracking: self.track.finish(0),
             counts: self.source.counts(),
             n_dropped: 0,
             decode_secs: self.source.decode_secs,
@@ -142,9 +162,24 @@ impl Stages {
         let (snapshots_tx, snapshots) = queue("snapshots", 1, WhenFull::DropOldest);
         let (progress_tx, progress) = queue("progress", 1, WhenFull::DropOldest);
 
-        let source = spawn("source", move || run_source(self.source, &frames_tx))?;
+        let (heard_policy, news_policy) = policies(is_live);
+        let (heard_tx, heard) = queue("heard", HEARD_QUEUE, heard_policy);
+        let (news_tx, news) = queue("news", 1, news_policy);
+        // Live, the tracker must not wait for selection; in a replay, selection says what it has to wait for.
+        let heard_tx = self.track.is_on().then_some(heard_tx);
+        let news_tx = self.track.is_on().then_some(news_tx);
+        let (from_source, from_select) = if is_live {
+            (heard_tx, None)
+        } else {
+            (None, heard_tx)
+        };
+
+        let track = spawn("track", move || run_track(self.track, &heard, &news))?;
+        let source = spawn("source", move || {
+            run_source(self.source, &frames_tx, from_source.as_ref())
+        })?;
         let select = spawn("select", move || {
-            run_select(self.select, &frames, &batches_tx)
+            run_select(self.select, &frames, &batches_tx, from_select.as_ref())
         })?;
         let geometry = spawn("geometry", move || {
             run_geometry(self.geometry, &batches, &answers_tx)
@@ -155,7 +190,12 @@ impl Stages {
                 drop(snapshots_tx.send(snapshot));
                 progress_tx.send(progress).ok();
             };
-            run_map(self.map, is_live, &answers, &mut publish)
+            run_map(
+                self.map,
+                (is_live, news_tx.as_ref()),
+                &answers,
+                &mut publish,
+            )
         })?;
         let publisher = spawn("publish", move || {
             run_publisher(self.subscriber, &snapshots)
@@ -169,7 +209,9 @@ impl Stages {
         let (geometry, error) = joined("geometry", geometry)?;
         let (map, snapshot) = joined("map", map)?;
         let subscriber = joined("publish", publisher)?;
+        let tracking = joined("track", track)?;
         Ok(End {
+            tracking,
             counts: source.counts(),
             n_dropped,
             decode_secs: source.decode_secs,
@@ -198,7 +240,9 @@ impl End {
                 decode: self.decode_secs,
                 geometry: self.geometry.secs,
                 optimise: self.map.optimise_secs,
+                track: self.tracking.secs,
             },
+            tracking: self.tracking,
             keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
             map: self.map.map,
@@ -209,8 +253,13 @@ impl End {
     }
 }
 
-fn run_source(mut stage: SourceStage, frames: &Sender<Frame>) -> (SourceStage, u64) {
+fn run_source(
+    mut stage: SourceStage,
+    frames: &Sender<Frame>,
+    heard: Option<&Sender<Heard>>,
+) -> (SourceStage, u64) {
     while let Some(frame) = stage.next() {
+        tell(heard, &frame);
         if frames.send(frame).is_err() {
             break;
         }
@@ -222,16 +271,26 @@ fn run_select(
     mut stage: SelectStage,
     frames: &Receiver<Frame>,
     batches: &Sender<Arc<Batch>>,
+    heard: Option<&Sender<Heard>>,
 ) -> SelectStage {
+    // The tracker hears of a batch before geometry does: news of a batch can always be taken, so that nobody waits in
+    // a circle.
+    let send = |batch: Batch| {
+        if let Some(heard) = heard {
+            drop(heard.send(Heard::Batch));
+        }
+        batches.send(Arc::new(batch)).is_ok()
+    };
     while let Some(frame) = frames.recv() {
+        tell(heard, &frame);
         if let Some(batch) = stage.push(frame)
-            && batches.send(Arc::new(batch)).is_err()
+            && !send(batch)
         {
             return stage;
         }
     }
     if let Some(batch) = stage.finish() {
-        drop(batches.send(Arc::new(batch)));
+        send(batch);
     }
     stage
 }
@@ -262,15 +321,22 @@ fn run_geometry(
 
 fn run_map(
     mut stage: MapStage,
-    is_live: bool,
+    (is_live, news): (bool, Option<&Sender<News>>),
     answers: &Receiver<Answer>,
     publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
 ) -> (MapStage, Arc<Snapshot>) {
+    let mut since_news = Stopwatch::start();
     loop {
         let answer = if is_live {
             match answers.try_recv() {
                 Ok(Some(answer)) => Some(answer),
-                Ok(None) if stage.step_while_waiting(publish) => continue,
+                Ok(None) if stage.step_while_waiting(publish) => {
+                    if since_news.secs() > NEWS_SECS {
+                        send_news(&mut stage, news);
+                        since_news = Stopwatch::start();
+                    }
+                    continue;
+                }
                 Ok(None) => answers.recv(),
                 Err(Ended) => None,
             }
@@ -281,9 +347,18 @@ fn run_map(
             break;
         };
         stage.add(batch.as_deref(), geometry, publish);
+        send_news(&mut stage, news);
     }
     let snapshot = stage.finish(publish);
+    send_news(&mut stage, news);
     (stage, snapshot)
+}
+
+fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
+    if let Some(news) = news {
+        // A tracker that is gone is no reason to stop mapping.
+        drop(news.send(stage.map.keyframe_views()));
+    }
 }
 
 fn run_publisher(

@@ -13,14 +13,16 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt as log_format};
 
-use crate::clock::Stamp;
 use crate::config::Settings;
 use crate::eval::comparisons::Comparison;
+use crate::eval::frames::{self, FrameRow, Source as Known};
 use crate::eval::health::write_health;
 use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
-use crate::eval::report::{FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing};
+use crate::eval::report::{
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures, percentile,
+};
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
 use crate::frame::RgbImage;
@@ -97,16 +99,22 @@ pub fn finish(
         Some(_) => measure_quality(outcome, params.map.holdout, lpips),
         None => (Quality::default(), Vec::new()),
     };
-    let report = report(outcome, settings, quality);
+    let tracks = &outcome.tracking.tracks.frames;
+    let keyframes = timed_keyframes(&outcome.snapshot);
+    let rows = frames::rows(&keyframes, tracks, &outcome.frame_stamps);
+    let report = Report {
+        tracking: tracking_figures(outcome, &rows),
+        ..report(outcome, settings, quality)
+    };
     if let Some(out) = out {
-        write(outcome, &report, &comparisons, out, input)?;
+        write(outcome, (&report, &rows), &comparisons, out, input)?;
     }
     Ok(summary(&report, out))
 }
 
 fn write(
     outcome: &mut Outcome,
-    report: &Report,
+    (report, rows): (&Report, &[FrameRow]),
     comparisons: &[Comparison],
     out: &Path,
     input: &str,
@@ -114,7 +122,8 @@ fn write(
     let health = outcome.map.health();
     let snapshot = &outcome.snapshot;
     let keyframes = timed_keyframes(snapshot);
-    let frames = interpolate(&keyframes, &outcome.frame_stamps);
+    let frames = frames::trajectory(rows);
+    let live = frames::live_trajectory(&outcome.tracking.tracks.frames);
     let truth: Vec<TimedPose> = outcome
         .truth
         .iter()
@@ -137,11 +146,14 @@ fn write(
         snapshot: (**snapshot).clone(),
         seed: report.seed,
         steps: outcome.map.n_steps(),
+        landmarks: std::mem::take(&mut outcome.tracking.landmarks),
     };
-    let results: [anyhow::Result<()>; 7] = [
+    let results: [anyhow::Result<()>; 9] = [
         write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
         write_health(&health, &out.join("keyframes.csv")).map_err(Into::into),
         write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
+        write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
+        frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
         ply::write(&snapshot.splats, &out.join("map.ply")).map_err(Into::into),
         checkpoint::write(&checkpoint, &out.join("map.splatmap")).map_err(Into::into),
         report.write(&out.join("report.json")).map_err(Into::into),
@@ -179,19 +191,22 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             decode: outcome.secs.decode,
             geometry: outcome.secs.geometry,
             optimise,
+            track: outcome.secs.track,
         },
         steps_per_s: (steps > 0 && optimise > 0.0).then(|| steps as f64 / optimise),
         latency_ms: Latency::of(
             &outcome.keyframe_to_pose_secs,
             &outcome.keyframe_to_snapshot_secs,
+            &outcome.tracking.latency_secs,
         ),
+        tracking: TrackingFigures::default(),
         peak_rss_mib: peak_rss_mib(),
         peak_gpu_mib: match outcome.map.peak_gpu_bytes() {
             0 => None,
             n_bytes => Some(n_bytes as f64 / (1 << 20) as f64),
         },
         quality,
-        scale: Scale::of(snapshot.scale),
+        scale: snapshot.scale.into(),
         source_fault: outcome.counts.fault.clone(),
         geometry_note: outcome.geometry_note.clone(),
         error: outcome.error.clone(),
@@ -281,28 +296,24 @@ fn timed_keyframes(snapshot: &Arc<Snapshot>) -> Vec<TimedPose> {
     snapshot.poses.iter().map(timed).collect()
 }
 
-/// Poses of all frames between the first and the last keyframe: linear between neighbouring keyframes. Frames
-/// outside have no pose, rather than a guessed one.
-fn interpolate(keyframes: &[TimedPose], stamps: &[Stamp]) -> Vec<TimedPose> {
-    let pose_at = |stamp: Stamp| {
-        let after = keyframes.partition_point(|k| k.stamp < stamp);
-        let next = keyframes.get(after)?;
-        if next.stamp == stamp {
-            return Some(next.pose);
-        }
-        let last = &keyframes[after.checked_sub(1)?];
-        let share = stamp.secs_since(last.stamp) / next.stamp.secs_since(last.stamp);
-        Some(last.pose.between(&next.pose, share))
+fn tracking_figures(outcome: &Outcome, rows: &[FrameRow]) -> TrackingFigures {
+    let tracking = &outcome.tracking;
+    let n_known = |wanted: &[Known]| {
+        let found = rows.iter().filter(|row| wanted.contains(&row.source));
+        found.count() as u64
     };
-    stamps
-        .iter()
-        .filter_map(|stamp| {
-            Some(TimedPose {
-                stamp: *stamp,
-                pose: pose_at(*stamp)?,
-            })
-        })
-        .collect()
+    let work_ms = |share| percentile(&tracking.frame_secs, share).map(|secs| secs * 1e3);
+    TrackingFigures {
+        frames: tracking.tracks.n_frames,
+        dropped: tracking.n_dropped,
+        tracked: tracking.tracks.n_tracked,
+        posed: n_known(&[Known::Keyframe, Known::Tracked, Known::Late]),
+        interpolated: n_known(&[Known::Interpolated]),
+        lost: tracking.tracks.n_lost,
+        relocalised: tracking.tracks.n_relocalised,
+        work_ms_p50: work_ms(0.5),
+        work_ms_p95: work_ms(0.95),
+    }
 }
 
 fn summary(report: &Report, out: Option<&Path>) -> String {

@@ -8,7 +8,7 @@ use serde::de::DeserializeOwned;
 
 use crate::clock::Stamp;
 use crate::map::layout;
-use crate::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::publish::type_hash::dds_type_name;
 use crate::publish::wire::{KeyframeArray, MAX_MESSAGE_BYTES, SplatChunk, SplatManifest};
 use crate::ros::{self, Message};
@@ -59,7 +59,7 @@ struct Open {
     identity: Identity,
     /// `None` until the manifest or a chunk is there.
     shape: Option<Shape>,
-    manifest: Option<(u32, ScaleSource, Stamp)>,
+    manifest: Option<(u32, Scale, Stamp)>,
     /// By chunk_ix.
     pieces: BTreeMap<u32, Piece>,
     /// By first_ix.
@@ -176,7 +176,11 @@ impl Assembler {
             n_chunks: manifest.n_chunks,
             sh_degree: manifest.sh_degree,
         };
-        let scale = ScaleSource::from_code(manifest.scale_source);
+        let scale = Scale::of_numbers((
+            manifest.scale_source,
+            manifest.metres_per_unit,
+            manifest.scale_std,
+        ));
         let is_sound = shape.sh_degree <= layout::MAX_SH_DEGREE
             && shape.n_chunks <= shape.n_splats
             && (shape.n_chunks == 0) == (shape.n_splats == 0);

@@ -52,6 +52,8 @@ pub struct SplatManifest {
     pub n_chunks: u32,
     pub n_keyframes: u32,
     pub scale_source: u8,
+    pub metres_per_unit: f64,
+    pub scale_std: f64,
 }
 
 /// `splat_mapper_msgs/msg/KeyframePose`.
@@ -154,6 +156,7 @@ impl<'a> Messages<'a> {
 
     pub fn manifest(&self) -> SplatManifest {
         let snapshot = self.snapshot;
+        let (scale_source, metres_per_unit, scale_std) = snapshot.scale.to_numbers();
         SplatManifest {
             header: self.header(),
             map_id: snapshot.map_id,
@@ -164,7 +167,9 @@ impl<'a> Messages<'a> {
             sh_degree: snapshot.splats.sh_degree,
             n_chunks: self.n_chunks() as u32,
             n_keyframes: snapshot.poses.len() as u32,
-            scale_source: snapshot.scale.code(),
+            scale_source,
+            metres_per_unit,
+            scale_std,
         }
     }
 

@@ -33,6 +33,7 @@ fn frame(seq: u64, shift_px: f64, contrast: f64) -> Frame {
         }),
         intrinsics: None,
         truth: None,
+        odometry: None,
         truth_depth: None,
         is_held_out: false,
     }

@@ -177,6 +177,7 @@ impl ImagesSource {
             Ok(picture) => {
                 let extras = Extras {
                     truth: entry.truth,
+                    odometry: None,
                     truth_depth: self.depth_of(entry),
                     lens: entry.lens,
                     is_held_out: entry.is_held_out,

@@ -23,6 +23,7 @@ const MAX_WAIT_SECS: f64 = 2.0;
 #[derive(Debug, Default)]
 pub struct Extras {
     pub truth: Option<Rigid>,
+    pub odometry: Option<Rigid>,
     pub truth_depth: Option<DepthMap>,
     /// This picture's own lens, where the pictures of an input differ; their sizes may then differ, too.
     pub lens: Option<Lens>,
@@ -182,6 +183,7 @@ impl Intake {
             image: Arc::new(image),
             intrinsics: working.intrinsics,
             truth: extras.truth,
+            odometry: extras.odometry,
             truth_depth,
             is_held_out: extras.is_held_out,
         }

@@ -12,8 +12,8 @@ use crate::ros::{self, CompressedImage, Image};
 use crate::source::bag::{Bag, files_of, not_mcap};
 use crate::source::intake::{Arrival, Extras, Intake};
 use crate::source::survey::{Survey, header_stamp};
-use crate::source::topics::{depth_topic_of, image_topic_of, lens_of, truth_of};
-use crate::source::truth::{Truth, half_interval};
+use crate::source::topics::{depth_topic_of, image_topic_of, lens_of, odometry_of, truth_of};
+use crate::source::truth::{Odometry, Truth, half_interval};
 use crate::source::{Source, SourceCounts, SourceError};
 
 /// Pictures, and depth maps, that wait for each other: their messages may lie so far apart in the recording.
@@ -35,6 +35,7 @@ pub struct McapSource {
     is_compressed: bool,
     depth_topic: Option<String>,
     truth: Truth,
+    odometry: Odometry,
     truth_within_nanos: i64,
     n_images: u64,
     max_frames: u64,
@@ -57,7 +58,7 @@ impl McapSource {
                 path: path.to_owned(),
             });
         }
-        let survey = Survey::of(files.clone());
+        let mut survey = Survey::of(files.clone());
         let image_topic = image_topic_of(&survey, params, path)?;
         let topic = &survey.topics[&image_topic];
         if survey.has_left_out {
@@ -81,6 +82,7 @@ impl McapSource {
             depth_topic,
             truth_within_nanos,
             n_images,
+            odometry: odometry_of(&mut survey, &image_topic, params),
             truth: truth_of(survey, &image_topic, params),
             image_topic,
             max_frames: params.max_frames,
@@ -176,6 +178,7 @@ impl McapSource {
             picture,
             Extras {
                 truth,
+                odometry: self.odometry.at(arrival.stamp),
                 truth_depth,
                 ..Extras::default()
             },

@@ -4,8 +4,10 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use crate::clock::Stamp;
+use crate::ros::odometry::Odometry;
 use crate::ros::{self, CameraInfo, CompressedImage, Image, Message as _, PoseStamped, TfMessage};
 use crate::source::bag::{Bag, Message};
 use crate::source::calibration::lens_of_camera_info;
@@ -55,7 +57,9 @@ pub(super) struct Survey {
     /// The first of each topic that can be a calibration, else the first.
     pub infos: BTreeMap<String, CameraInfo>,
     pub poses: BTreeMap<String, Track>,
-    pub transforms: Transforms,
+    /// (frame that moves, its poses) by topic.
+    pub odometry: BTreeMap<String, (String, Track)>,
+    pub transforms: Arc<Transforms>,
     pub fault: Option<String>,
     /// Poses or transforms beyond what is kept.
     pub has_left_out: bool,
@@ -132,14 +136,32 @@ impl Survey {
                 let track = self.poses.entry(channel.topic.clone()).or_default();
                 self.has_left_out |= !track.insert(pose.header.stamp.into(), world_from_cam);
             }
+            Odometry::TYPE_NAME => self.note_odometry(message),
             TfMessage::TYPE_NAME => {
                 if let Ok(transforms) = ros::decode::<TfMessage>(message.payload) {
                     let is_static = channel.topic.ends_with("tf_static");
-                    self.has_left_out |= !self.transforms.insert(&transforms, is_static);
+                    self.has_left_out |=
+                        !Arc::make_mut(&mut self.transforms).insert(&transforms, is_static);
                 }
             }
             _ => {}
         }
+    }
+
+    fn note_odometry(&mut self, message: &Message<'_>) {
+        let Ok(odometry) = ros::decode::<Odometry>(message.payload) else {
+            return;
+        };
+        let Some(odom_from_base) = odometry.pose.pose.to_rigid() else {
+            return;
+        };
+        let topic = message.channel.topic.clone();
+        let base = odometry.child_frame_id;
+        let (_, track) = self
+            .odometry
+            .entry(topic)
+            .or_insert_with(|| (base, Track::default()));
+        self.has_left_out |= !track.insert(odometry.header.stamp.into(), odom_from_base);
     }
 
     fn note_info(&mut self, message: &Message<'_>) {

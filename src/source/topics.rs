@@ -1,14 +1,16 @@
 //! Survey of a recording -> which of its topics are the picture, the calibration, the depth and the ground truth.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use crate::camera::Lens;
 use crate::config::SourceParams;
+use crate::pose::Rigid;
 use crate::ros::CameraInfo;
 use crate::source::SourceError;
 use crate::source::calibration::lens_of_camera_info;
 use crate::source::survey::{Survey, Topic};
-use crate::source::truth::Truth;
+use crate::source::truth::{Odometry, Truth};
 
 pub(super) fn image_topic_of(
     survey: &Survey,
@@ -120,6 +122,46 @@ fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
         .next()
         .is_some_and(|name| name.starts_with("image_rect"))
         && info.p[0] > 0.0
+}
+
+pub(super) fn odometry_of(
+    survey: &mut Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> Odometry {
+    let wanted = &params.odometry_topic;
+    let name = if wanted.is_empty() {
+        survey.odometry.keys().next().cloned()
+    } else {
+        Some(wanted.clone())
+    };
+    let camera_frame = survey
+        .topics
+        .get(image_topic)
+        .map(|topic| topic.frame_id.clone())
+        .unwrap_or_default();
+    if let Some((base, track)) = name.and_then(|name| survey.odometry.remove(&name)) {
+        let mounted = survey.transforms.fixed(&base, &camera_frame);
+        if mounted.is_none() {
+            tracing::warn!(
+                "no fixed transforms from {base:?} to the camera {camera_frame:?}: it counts as mounted where odometry turns"
+            );
+        }
+        return Odometry::Messages {
+            track,
+            base_from_cam: mounted.unwrap_or(Rigid::IDENTITY),
+        };
+    }
+    if !wanted.is_empty() {
+        let listing = survey.listing();
+        tracing::warn!("no odometry on topic {wanted:?}; found {listing}");
+    } else if survey.transforms.reaches_odometry(&camera_frame) {
+        return Odometry::Transforms {
+            transforms: Arc::clone(&survey.transforms),
+            camera_frame,
+        };
+    }
+    Odometry::None
 }
 
 pub(super) fn truth_of(mut survey: Survey, image_topic: &str, params: &SourceParams) -> Truth {

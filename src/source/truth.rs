@@ -3,6 +3,7 @@
 //! Knows nothing of files. Poses are `world_from_cam` with OpenCV axes.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use crate::clock::Stamp;
 use crate::pose::{Rigid, extent};
@@ -14,6 +15,10 @@ const MAX_POSES: usize = 400_000;
 const MAX_CHAIN: usize = 32;
 /// Frames that count as the fixed world, best first (REP-105).
 const WORLD_FRAMES: [&str; 2] = ["map", "world"];
+/// Frame in which odometry counts its steps (REP-105).
+const ODOM_FRAME: &str = "odom";
+/// Odometry is not told across longer gaps.
+const MAX_ODOMETRY_GAP_NANOS: i64 = 500_000_000;
 /// Assumed between frames when a recording has a single one.
 const FALLBACK_INTERVAL_NANOS: i64 = 100_000_000;
 
@@ -23,7 +28,7 @@ pub(super) enum Truth {
     None,
     Track(Track),
     Transforms {
-        transforms: Transforms,
+        transforms: Arc<Transforms>,
         camera_frame: String,
     },
 }
@@ -75,6 +80,18 @@ impl Track {
         (!positions.is_empty()).then(|| extent(&positions))
     }
 
+    /// The pose at a time between two that are not far apart.
+    pub(super) fn between(&self, stamp: Stamp) -> Option<Rigid> {
+        let before = self.by_nanos.range(..=stamp.nanos).next_back()?;
+        let after = self.by_nanos.range(stamp.nanos..).next()?;
+        let gap = after.0.checked_sub(*before.0)?;
+        if gap > MAX_ODOMETRY_GAP_NANOS {
+            return None;
+        }
+        let share = (stamp.nanos - before.0) as f64 / gap.max(1) as f64;
+        Some(before.1.between(after.1, share))
+    }
+
     /// The pose nearest in time, if it is at most `within_nanos` away.
     pub(super) fn nearest(&self, stamp: Stamp, within_nanos: i64) -> Option<Rigid> {
         let before = self.by_nanos.range(..=stamp.nanos).next_back();
@@ -85,6 +102,41 @@ impl Track {
             .chain(after)
             .min_by_key(|(nanos, _)| distance(nanos))?;
         (distance(nearest.0) <= within_nanos.unsigned_abs()).then_some(*nearest.1)
+    }
+}
+
+/// Where odometry comes from: `odom_from_cam`.
+#[derive(Debug, Default)]
+pub(super) enum Odometry {
+    #[default]
+    None,
+    Messages {
+        /// `odom_from_base`.
+        track: Track,
+        base_from_cam: Rigid,
+    },
+    Transforms {
+        transforms: Arc<Transforms>,
+        camera_frame: String,
+    },
+}
+
+impl Odometry {
+    pub(super) fn at(&self, stamp: Stamp) -> Option<Rigid> {
+        match self {
+            Self::None => None,
+            Self::Messages {
+                track,
+                base_from_cam,
+            } => Some(track.between(stamp)? * *base_from_cam),
+            Self::Transforms {
+                transforms,
+                camera_frame,
+            } => {
+                let chain = transforms.chain(camera_frame, ODOM_FRAME)?;
+                Transforms::along(&chain, |track| track.between(stamp))
+            }
+        }
     }
 }
 
@@ -103,14 +155,14 @@ pub(super) fn half_interval(stamps: &[Stamp]) -> i64 {
 }
 
 /// Transforms of a recording: each frame has one parent at a time.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Transforms {
     /// child -> (parent, parent_from_child over time, is it static).
     links: BTreeMap<String, Link>,
     n_transforms: usize,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Link {
     parent: String,
     is_static: bool,
@@ -160,16 +212,32 @@ impl Transforms {
         let chain = WORLD_FRAMES
             .iter()
             .find_map(|world| self.chain(camera_frame, world))?;
-        let mut world_from_cam = Rigid::IDENTITY;
+        Self::along(&chain, |track| track.nearest(stamp, within_nanos))
+    }
+
+    /// The transform up a chain; moving links are asked for their own.
+    fn along(chain: &[&Link], moving: impl Fn(&Track) -> Option<Rigid>) -> Option<Rigid> {
+        let mut top_from_child = Rigid::IDENTITY;
         for link in chain {
             let parent_from_child = if link.is_static {
                 link.track.by_nanos.values().next_back().copied()
             } else {
-                link.track.nearest(stamp, within_nanos)
+                moving(&link.track)
             };
-            world_from_cam = parent_from_child? * world_from_cam;
+            top_from_child = parent_from_child? * top_from_child;
         }
-        Some(world_from_cam)
+        Some(top_from_child)
+    }
+
+    /// Whether odometry's frame is above the camera's.
+    pub(super) fn reaches_odometry(&self, camera_frame: &str) -> bool {
+        self.chain(camera_frame, ODOM_FRAME).is_some()
+    }
+
+    /// How the camera is mounted: links of a robot's body, which never move.
+    pub(super) fn fixed(&self, parent: &str, child: &str) -> Option<Rigid> {
+        let chain = self.chain(child, parent.trim_start_matches('/'))?;
+        Self::along(&chain, |_| None)
     }
 
     /// Links from the camera up to `world`.

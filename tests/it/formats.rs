@@ -9,7 +9,7 @@ use splat_mapper::camera::Intrinsics;
 use splat_mapper::clock::Stamp;
 use splat_mapper::export::ply;
 use splat_mapper::map::checkpoint::{self, Checkpoint, CheckpointError};
-use splat_mapper::map::snapshot::{KeyframePose, ScaleSource, Snapshot};
+use splat_mapper::map::snapshot::{KeyframePose, Scale, Snapshot};
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::Splats;
 
@@ -81,7 +81,7 @@ pub(crate) fn random_snapshot(
         epoch: 2,
         revision,
         stamp: poses.last().map_or(Stamp::default(), |pose| pose.stamp),
-        scale: ScaleSource::Given,
+        scale: Scale::GIVEN,
         poses,
         splats: Arc::new(random_splats(n_splats, sh_degree, u64::from(revision))),
     }
@@ -89,6 +89,7 @@ pub(crate) fn random_snapshot(
 
 fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
     Checkpoint {
+        landmarks: vec![7; 33],
         snapshot: random_snapshot(n_splats, 5, sh_degree, 9),
         seed: 11,
         steps: 3000,
@@ -114,6 +115,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
             "{n_splats} splats of degree {sh_degree}"
         );
         assert_eq!((back.seed, back.steps), (11, 3000));
+        assert_eq!(back.landmarks, written.landmarks);
     }
 }
 
@@ -131,7 +133,7 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
         end += 16 + n;
     }
     assert_eq!(boundaries.pop(), Some(bytes.len()));
-    assert_eq!(boundaries.len(), 5 + 4 * 3 - 1);
+    assert_eq!(boundaries.len(), 5 + 4 * 4 - 1);
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {

@@ -11,7 +11,7 @@ use splat_mapper::geometry::GeometryModel as _;
 use splat_mapper::map::SplatMap;
 use splat_mapper::map::align::Carry;
 use splat_mapper::map::schedule::Phase;
-use splat_mapper::map::snapshot::{ScaleSource, Snapshot};
+use splat_mapper::map::snapshot::{Scale, Snapshot};
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::CpuEngine;
 use splat_mapper::splat::{
@@ -136,7 +136,7 @@ fn map_params(pose: PoseRefinement) -> MapParams {
 fn map_of(engine: Pushed, pose: PoseRefinement, batches: &[&[usize]]) -> (SplatMap, Vec<Snapshot>) {
     let (frames, extent) = room();
     let mut model = known(Settings::shipped().params().unwrap().known, extent);
-    let mut map = SplatMap::new(map_params(pose), 3, ScaleSource::Given, Box::new(engine));
+    let mut map = SplatMap::new(map_params(pose), 3, Scale::GIVEN, Box::new(engine));
     let mut after = Vec::new();
     for (id, numbers) in (0..).zip(batches) {
         let all: Vec<(u32, Frame)> = numbered(&frames, true);

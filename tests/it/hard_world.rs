@@ -106,6 +106,7 @@ pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrin
             image,
             intrinsics: Some(lens),
             truth: None,
+            odometry: None,
             truth_depth: None,
             is_held_out: false,
         };

@@ -270,6 +270,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
             }),
             intrinsics: None,
             truth: None,
+            odometry: None,
             truth_depth: None,
             is_held_out: false,
         };

@@ -327,7 +327,7 @@ fn type_hashes_are_those_of_ros_2() {
     );
     assert_eq!(
         type_hash::<SplatManifest>(),
-        "RIHS01_ecae8b360482dcaabd4d9452c7edb9b4a99d155ddb3c3a1e09ee3e208f61da37"
+        "RIHS01_d9cfd3a8140918ac501a45c04c77ef7542bce4930799ea7e572cdcb21213d2c7"
     );
     assert_eq!(
         type_hash::<KeyframePoseMsg>(),

@@ -55,6 +55,8 @@ fn a_replay_writes_a_whole_run_directory() {
     );
     for name in [
         "trajectory.tum",
+        "trajectory_live.tum",
+        "frames.csv",
         "keyframes.tum",
         "map.ply",
         "map.splatmap",

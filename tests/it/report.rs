@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 use splat_mapper::config::Settings;
 use splat_mapper::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Scale, Timing,
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
 };
-use splat_mapper::map::snapshot::ScaleSource;
+use splat_mapper::map::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.
 const KEYS: &str = "\
@@ -21,6 +21,8 @@ geometry_note
 keyframes.components
 keyframes.registered
 keyframes.selected
+latency_ms.frame_to_pose_p50
+latency_ms.frame_to_pose_p95
 latency_ms.keyframe_to_pose_p50
 latency_ms.keyframe_to_pose_p95
 latency_ms.keyframe_to_snapshot_p50
@@ -45,7 +47,17 @@ steps_per_s
 timing_s.decode
 timing_s.geometry
 timing_s.optimise
+timing_s.track
 timing_s.wall
+tracking.dropped
+tracking.frames
+tracking.interpolated
+tracking.lost
+tracking.posed
+tracking.relocalised
+tracking.tracked
+tracking.work_ms_p50
+tracking.work_ms_p95
 version";
 
 pub(crate) fn sample_report() -> Report {
@@ -74,9 +86,15 @@ pub(crate) fn sample_report() -> Report {
             decode: 1.9,
             geometry: 61.4,
             optimise: 96.0,
+            track: 2.6,
         },
         steps_per_s: Some(12.5),
-        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0]),
+        latency_ms: Latency::of(&[0.81, 0.9, 1.7], &[2.1, 2.4, 4.0], &[0.0125, 0.0125]),
+        tracking: TrackingFigures {
+            frames: 50,
+            tracked: 47,
+            ..TrackingFigures::default()
+        },
         peak_rss_mib: Some(731.4),
         peak_gpu_mib: None,
         quality: Quality {
@@ -86,7 +104,7 @@ pub(crate) fn sample_report() -> Report {
             ssim_holdout: Some(0.791),
             lpips_holdout: None,
         },
-        scale: Scale::of(ScaleSource::UpToScale),
+        scale: snapshot::Scale::UP_TO_SCALE.into(),
         source_fault: None,
         geometry_note: Some(
             "keyframe 21 shares too few features with its neighbours (motion blur)".to_owned(),

@@ -101,6 +101,7 @@ pub(crate) fn keyframe(
         }),
         intrinsics: calibrated.then(|| lens.resized(w, h)),
         truth: None,
+        odometry: None,
         truth_depth: None,
         is_held_out: false,
     };

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::Matched;
+use super::agreeing::by_depth;
 use super::tracks::{Track, sight};
 use crate::geometry::triangulate::triangulate;
 use crate::pose::Rigid;
@@ -30,21 +31,10 @@ impl State {
             tracks: Vec::new(),
         };
         for track in tracks {
-            let by_depth: Vec<DVec3> = track
-                .iter()
-                .filter_map(|&(view, feature)| {
-                    let shot = &matched.shots[view];
-                    let depth = depths[view][feature]?;
-                    let in_cam = shot.lens.ray_in_cam(shot.pixels[feature]) * depth;
-                    Some(shot.cam_from_batch.inverse().transform_point(in_cam))
-                })
-                .collect();
-            let point = if by_depth.is_empty() {
+            let point = by_depth(matched, track, depths).or_else(|| {
                 let sights: Vec<_> = track.iter().map(|&at| sight(matched, at)).collect();
                 triangulate(&sights)
-            } else {
-                Some(by_depth.iter().sum::<DVec3>() / by_depth.len() as f64)
-            };
+            });
             if let Some(point) = point.filter(|p| p.is_finite()) {
                 state.points.push(point);
                 state.tracks.push(track.clone());

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::{Matched, Pair, Shot};
+use super::{Matched, Pair, Shot, depth_at};
 use crate::config::SfmParams;
 use crate::config::align::AlignParams;
 use crate::frame::RgbImage;
@@ -25,8 +25,10 @@ const MAX_PAIRS: usize = 12;
 const MIN_SHARED: f64 = 0.3;
 /// Depths of a view that stand for its surface, along each side.
 const GRID: usize = 12;
-/// Keyframes whose features are remembered.
-const MAX_HELD: usize = 64;
+/// Pairs of one view among all keyframes: those that see most of the same surface.
+const MAX_COVISIBLE: usize = 8;
+/// Keyframes whose features are remembered, at least.
+const MIN_HELD: usize = 64;
 /// Longer side of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
 /// The focal length that verification rests on is the network's, so it is laxer than with a calibrated camera.
@@ -42,6 +44,7 @@ pub struct Matcher {
     max_features: usize,
     max_side: u32,
     max_error_px: f64,
+    max_held: usize,
     seed: u64,
     held: BTreeMap<u32, Held>,
     /// By keyframe ids in rising order; empty where two do not match.
@@ -57,12 +60,13 @@ struct Held {
 
 impl Matcher {
     /// An error where the parameters name a network for features that is not there.
-    pub fn new(sfm: &SfmParams, seed: u64) -> Result<Self, FeaturesError> {
+    pub fn new(sfm: &SfmParams, max_held: usize, seed: u64) -> Result<Self, FeaturesError> {
         Ok(Self {
             finder: Finder::new(sfm)?,
             max_features: sfm.max_features,
             max_side: sfm.max_side,
             max_error_px: sfm.max_error_px,
+            max_held: max_held.max(MIN_HELD),
             seed,
             held: BTreeMap::new(),
             pairs: BTreeMap::new(),
@@ -78,7 +82,37 @@ impl Matcher {
         params: &AlignParams,
     ) -> Matched {
         self.look(views, pictures);
-        let candidates = candidates(views, params.max_pair_deg);
+        self.matched_pairs(
+            views,
+            &candidates(views, params.max_pair_deg),
+            params.max_matches,
+        )
+    }
+
+    /// The same of many views that were looked at before: what was matched among them then, and pairs that see the
+    /// same surface.
+    pub fn matched_anew(&mut self, views: &[View], max_matches: usize) -> Matched {
+        let ix_of: BTreeMap<u32, usize> = views
+            .iter()
+            .enumerate()
+            .map(|(ix, v)| (v.keyframe_id, ix))
+            .collect();
+        let mut chosen = covisible(views);
+        chosen.extend(self.pairs.keys().filter_map(|(a, b)| {
+            let (a, b) = (*ix_of.get(a)?, *ix_of.get(b)?);
+            Some((a.min(b), a.max(b)))
+        }));
+        chosen.sort_unstable();
+        chosen.dedup();
+        self.matched_pairs(views, &chosen, max_matches)
+    }
+
+    fn matched_pairs(
+        &mut self,
+        views: &[View],
+        candidates: &[(usize, usize)],
+        max_matches: usize,
+    ) -> Matched {
         let id = |ix: usize| views[ix].keyframe_id;
         let fresh: Vec<(usize, usize)> = candidates
             .iter()
@@ -89,7 +123,7 @@ impl Matcher {
             .par_iter()
             .map(|&(a, b)| {
                 let (a, b) = if id(a) < id(b) { (a, b) } else { (b, a) };
-                let found = self.verified([&views[a], &views[b]], params.max_matches);
+                let found = self.verified([&views[a], &views[b]], max_matches);
                 ((id(a), id(b)), found)
             })
             .collect();
@@ -128,7 +162,7 @@ impl Matcher {
         };
         let found: Vec<(u32, Held)> = fresh.par_iter().map(look).collect();
         self.held.extend(found);
-        while self.held.len() > MAX_HELD.max(views.len()) {
+        while self.held.len() > self.max_held.max(views.len()) {
             let oldest = self.held.keys().copied().find(|id| {
                 let is_needed = views.iter().any(|view| view.keyframe_id == *id);
                 !is_needed
@@ -152,6 +186,13 @@ impl Matcher {
             is_held: false,
             pixels: held.map_or_else(Vec::new, |held| held.features.pixels.clone()),
         }
+    }
+
+    /// The view's depth at each of its features.
+    pub(super) fn depths(&self, view: &View) -> Vec<Option<f64>> {
+        let shot = self.shot(view);
+        let at = |pixel: &DVec2| depth_at(&view.depth, &shot.lens, *pixel);
+        shot.pixels.iter().map(at).collect()
     }
 
     /// Matches of two views, the one with the lower id first, that agree with one rigid scene.
@@ -217,6 +258,24 @@ pub fn candidates(views: &[View], max_pair_deg: f64) -> Vec<(usize, usize)> {
     chosen.sort_unstable();
     chosen.dedup();
     chosen
+}
+
+/// Pairs (first < second) of views that see most of the same surface, wherever they are turned.
+fn covisible(views: &[View]) -> Vec<(usize, usize)> {
+    let of_view = |i: usize| {
+        let mut near: Vec<(f64, usize)> = (0..views.len())
+            .filter(|&j| j != i)
+            .map(|j| (shared_surface(&views[i], &views[j]), j))
+            .filter(|(share, _)| *share > MIN_SHARED)
+            .collect();
+        near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        near.truncate(MAX_COVISIBLE);
+        near.into_iter().map(move |(_, j)| (i.min(j), i.max(j)))
+    };
+    (0..views.len())
+        .into_par_iter()
+        .flat_map_iter(of_view)
+        .collect()
 }
 
 /// Share of the surface of `a` that lies inside the picture of `b`.

@@ -3,6 +3,7 @@
 //!
 //! docs/ALIGNMENT.md has the procedures, the noise that they are measured with and the figures.
 
+mod agreeing;
 pub mod bundle_state;
 pub mod depth_bundle;
 pub mod epipolar;
@@ -14,6 +15,7 @@ pub mod rescale;
 #[cfg(test)]
 mod tests;
 pub mod tracks;
+mod whole;
 pub mod window;
 
 use std::collections::BTreeMap;
@@ -24,14 +26,15 @@ use glam::{DVec2, DVec3};
 use self::bundle_state::Depths;
 use self::matches::Matcher;
 use self::tracks::{points, tracks};
+use self::whole::Whole;
 use self::window::{Joined, Windows};
 use crate::camera::Intrinsics;
 use crate::config::SfmParams;
 use crate::config::align::{AlignMethod, AlignParams};
 use crate::frame::{DepthMap, RgbImage};
-use crate::geometry::View;
 use crate::geometry::features::FeaturesError;
 use crate::geometry::two_view::median;
+use crate::geometry::{Revision, View};
 use crate::pose::Rigid;
 
 /// A correction after which the matches fit worse than before by this factor is put back. Not 1: a window that fits
@@ -94,6 +97,7 @@ pub struct Aligner {
     params: AlignParams,
     matcher: Matcher,
     pub windows: Windows,
+    whole: Whole,
 }
 
 impl Aligner {
@@ -101,8 +105,9 @@ impl Aligner {
     pub fn new(params: &AlignParams, sfm: &SfmParams, seed: u64) -> Result<Self, FeaturesError> {
         Ok(Self {
             params: params.clone(),
-            matcher: Matcher::new(sfm, seed)?,
+            matcher: Matcher::new(sfm, params.whole, seed)?,
             windows: Windows::new(params),
+            whole: Whole::default(),
         })
     }
 
@@ -141,9 +146,44 @@ impl Aligner {
             rescale::mask(&mut view.depth, self.params.depth_error);
         });
         self.windows.correct(&views[n_held..], &mut joined);
+        self.correct_whole(&views[n_held..], given, &mut joined);
         joined.note = joined.note.or(lost).or_else(|| refined.note.clone());
         joined.refined = refined;
         joined
+    }
+
+    /// What all keyframes say together, once no more will come.
+    pub fn finish(&mut self) -> Vec<Revision> {
+        let mut revised = Vec::new();
+        for component in self.whole.changed() {
+            let found = self
+                .whole
+                .correct(component, &mut self.matcher, &self.params);
+            revised.extend(found.map_or_else(Vec::new, |c| c.revised));
+        }
+        revised
+    }
+
+    /// Remembers the new views of a window, and corrects their component when it has grown by enough.
+    fn correct_whole(&mut self, fresh: &[View], given: Given, joined: &mut Joined) {
+        let Some(component) = fresh.first().map(|v| v.component) else {
+            return;
+        };
+        if self.params.whole == 0 {
+            return;
+        }
+        self.whole
+            .add(fresh, &self.matcher, given, self.params.whole);
+        if !self.whole.is_due(component) {
+            return;
+        }
+        if let Some(correction) = self
+            .whole
+            .correct(component, &mut self.matcher, &self.params)
+        {
+            self.windows.revise(&correction, joined);
+            joined.revised = correction.revised;
+        }
     }
 
     /// Corrects poses of one window in place, in whatever frame they share, and scales depth to fit them.

@@ -9,7 +9,7 @@ use crate::geometry::two_view::median;
 /// Longer tracks say more: beyond so many, the shorter ones are left.
 const MAX_TRACKS: usize = 1500;
 /// Below this angle between its rays a point's depth is mostly noise.
-const MIN_ANGLE_DEG: f64 = 1.0;
+pub(super) const MIN_ANGLE_DEG: f64 = 1.0;
 
 /// (view, feature) of each sight.
 pub type Track = Vec<(usize, usize)>;
@@ -23,37 +23,66 @@ pub struct Point {
     pub angle_rad: f64,
 }
 
-/// Matches joined over all pairs. A track that meets a view twice is a mistake somewhere and goes.
+/// The longest tracks of a window.
 pub fn tracks(matched: &Matched) -> Vec<Track> {
+    let mut tracks = all_tracks(matched);
+    tracks.truncate(MAX_TRACKS);
+    tracks
+}
+
+/// The longest tracks of many views, until each view has `per_view` of them or no more.
+pub fn covering_tracks(matched: &Matched, per_view: usize) -> Vec<Track> {
+    let mut counts = vec![0; matched.shots.len()];
+    let mut tracks = all_tracks(matched);
+    tracks.retain(|track| {
+        let is_wanted = track.iter().any(|&(view, _)| counts[view] < per_view);
+        if is_wanted {
+            track.iter().for_each(|&(view, _)| counts[view] += 1);
+        }
+        is_wanted
+    });
+    tracks
+}
+
+/// Matches joined over all pairs, the longest first. A match that would make a track meet a view twice is a mistake or
+/// comes after one, and is left; pairs with the most matches are mistaken least and come first.
+fn all_tracks(matched: &Matched) -> Vec<Track> {
     let mut first = Vec::with_capacity(matched.shots.len());
-    let mut n = 0;
-    for shot in &matched.shots {
-        first.push(n);
-        n += shot.pixels.len();
+    let mut members: Vec<Track> = Vec::new();
+    for (view, shot) in matched.shots.iter().enumerate() {
+        first.push(members.len());
+        members.extend((0..shot.pixels.len()).map(|feature| vec![(view, feature)]));
     }
-    let mut parent: Vec<usize> = (0..n).collect();
-    for pair in &matched.pairs {
+    let mut parent: Vec<usize> = (0..members.len()).collect();
+    let mut pairs: Vec<_> = matched.pairs.iter().collect();
+    pairs.sort_by_key(|pair| std::cmp::Reverse(pair.features.len()));
+    for pair in pairs {
         for &(i, j) in &pair.features {
             let a = root(&mut parent, first[pair.first] + i as usize);
             let b = root(&mut parent, first[pair.second] + j as usize);
-            parent[a.max(b)] = a.min(b);
+            if a != b
+                && let Some(both) = merged(&members[a], &members[b])
+            {
+                parent[a.max(b)] = a.min(b);
+                members[a.max(b)] = Track::new();
+                members[a.min(b)] = both;
+            }
         }
     }
-    let mut members: Vec<Track> = vec![Vec::new(); n];
-    for (view, shot) in matched.shots.iter().enumerate() {
-        for feature in 0..shot.pixels.len() {
-            let root = root(&mut parent, first[view] + feature);
-            members[root].push((view, feature));
-        }
-    }
-    members.retain(|track| {
-        let is_single = track.windows(2).all(|two| two[0].0 != two[1].0);
-        track.len() >= 2 && is_single
-    });
+    members.retain(|track| track.len() >= 2);
     // Stable: equals stay in the order of views and features.
     members.sort_by_key(|track| std::cmp::Reverse(track.len()));
-    members.truncate(MAX_TRACKS);
     members
+}
+
+/// Two tracks in order of views as one; `None` if they share a view.
+fn merged(a: &Track, b: &Track) -> Option<Track> {
+    let mut both = Track::with_capacity(a.len() + b.len());
+    both.extend_from_slice(a);
+    both.extend_from_slice(b);
+    both.sort_unstable();
+    let is_single = both.windows(2).all(|two| two[0].0 != two[1].0);
+    is_single.then_some(both)
 }
 
 fn root(parent: &mut [usize], mut at: usize) -> usize {

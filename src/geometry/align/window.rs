@@ -9,8 +9,9 @@ use glam::DVec3;
 
 use super::Refined;
 use super::overlap::{Shared, by_points, by_poses, inlier_share};
+use super::whole::Correction;
 use crate::config::align::{AlignParams, JoinBy};
-use crate::geometry::View;
+use crate::geometry::{Revision, View};
 use crate::pose::{Rigid, Similarity};
 
 /// Views kept besides those of `align.history`: what the next window may share.
@@ -57,6 +58,8 @@ pub struct Joined {
     pub note: Option<String>,
     /// What the correction of the window in its own frame did.
     pub refined: Refined,
+    /// Every keyframe of the component, where all of it was corrected.
+    pub revised: Vec<Revision>,
 }
 
 impl Joined {
@@ -123,6 +126,21 @@ impl Windows {
             let all = self.kept.iter_mut().chain(&mut joined.views);
             for view in all.filter(|v| v.keyframe_id == better.keyframe_id) {
                 *view = better.clone();
+            }
+        }
+    }
+
+    /// Takes over what the correction of the whole component found.
+    pub(super) fn revise(&mut self, correction: &Correction, joined: &mut Joined) {
+        for revision in &correction.revised {
+            let id = revision.keyframe_id;
+            let all = self.kept.iter_mut().chain(&mut joined.views);
+            for view in all.filter(|v| v.keyframe_id == id) {
+                view.batch_from_cam = revision.batch_from_cam;
+                view.intrinsics = revision.intrinsics;
+                let factor = correction.depth_factors.get(&id).copied().unwrap_or(1.0);
+                let values = view.depth.depth.iter_mut();
+                values.for_each(|d| *d = (f64::from(*d) * factor) as f32);
             }
         }
     }

@@ -25,7 +25,9 @@ use crate::geometry::onnx::decode::ModelCamera;
 use crate::geometry::onnx::losses::Losses;
 use crate::geometry::onnx::model::Model;
 use crate::geometry::onnx::preprocess::Fit;
-use crate::geometry::{GeometryBatch, GeometryError, GeometryModel, Health, PoseError, View};
+use crate::geometry::{
+    GeometryBatch, GeometryError, GeometryModel, Health, PoseError, Revision, View,
+};
 use crate::onnx::OnnxError;
 use crate::pose::Rigid;
 
@@ -201,10 +203,10 @@ impl Foundation {
         }
     }
 
-    /// Gives the frames of a window their places. Returns views of those that had none.
-    fn join(&mut self, window: Vec<Seen>) -> Vec<View> {
+    /// Gives the frames of a window their places: adds views of those that had none, and what others learn by them.
+    fn join(&mut self, window: Vec<Seen>, out: &mut GeometryBatch) {
         if window.is_empty() {
-            return Vec::new();
+            return;
         }
         let is_calibrated = window.iter().all(|seen| {
             self.params.intrinsics != IntrinsicsFrom::Model
@@ -228,7 +230,9 @@ impl Foundation {
         let told: Vec<_> = told.map(|k| (k.id, k)).collect();
         views.retain(|view| !self.placed.contains_key(&view.keyframe_id));
         self.placed.extend(told);
-        views
+        let is_elsewhere = |r: &Revision| views.iter().all(|v| v.keyframe_id != r.keyframe_id);
+        out.revise(joined.revised.into_iter().filter(is_elsewhere));
+        out.views.extend(views);
     }
 
     /// The batch, behind some placed keyframes where it shares none itself: its neighbour was dropped.
@@ -260,12 +264,12 @@ impl Foundation {
 
 impl GeometryModel for Foundation {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
-        let (mut views, mut done) = (Vec::new(), 0);
+        let (mut out, mut done) = (GeometryBatch::default(), 0);
         let keyframes = self.with_link(batch);
         let n = keyframes.len();
         while let Some(range) = window::next(done, n, self.window, self.params.window_overlap) {
             match self.ask(&keyframes[range.clone()]) {
-                Ok(window) => views.extend(self.join(window)),
+                Ok(window) => self.join(window, &mut out),
                 // What a network says against a window is mostly that memory is short.
                 Err(GeometryError::Model(ModelError::Onnx(error @ OnnxError::Network { .. })))
                     if range.len() > self.model.sidecar.s_min.max(MIN_FRAMES) =>
@@ -286,15 +290,15 @@ impl GeometryModel for Foundation {
         }
         Ok(GeometryBatch {
             batch_id: batch.id,
-            pose_error: self.pose_error(&views),
-            views,
+            pose_error: self.pose_error(&out.views),
             note: self.losses.note(),
-            ..GeometryBatch::default()
+            ..out
         })
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         Ok(GeometryBatch {
+            revised: self.aligner.finish(),
             note: self.losses.note(),
             ..GeometryBatch::default()
         })

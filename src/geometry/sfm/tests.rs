@@ -113,6 +113,7 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
             image: Arc::clone(&image),
             intrinsics,
             truth: None,
+            odometry: None,
             truth_depth: None,
             is_held_out: false,
         };
@@ -337,6 +338,7 @@ fn blank_tiny_and_broken_pictures_are_survived() {
             image,
             intrinsics: None,
             truth: None,
+            odometry: None,
             truth_depth: None,
             is_held_out: false,
         };

@@ -13,6 +13,7 @@ mod joinery;
 mod lens;
 mod light;
 mod noise;
+mod odometry;
 mod options;
 mod ornaments;
 mod pictures;
@@ -33,7 +34,7 @@ use std::sync::Arc;
 use crate::camera::{Intrinsics, Lens};
 use crate::config::SourceParams;
 use crate::frame::Frame;
-use crate::pose::extent;
+use crate::pose::{Rigid, extent};
 
 use super::rectify::Rectifier;
 use super::{Source, SourceCounts, SourceError};
@@ -46,7 +47,7 @@ pub enum SynthError {
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
     #[error(
-        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, speed, seed, quality, depth"
+        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, speed, seed, quality, depth, odometry"
     )]
     Option { key: String },
     #[error("option {key} of a synthetic scene = {found}, expected {expected}")]
@@ -105,6 +106,8 @@ pub struct SynthSettings {
     pub jpeg_quality: u8,
     /// Whether recordings carry a depth topic.
     pub depth: bool,
+    /// Share by which each step of the odometry is wrong (a standard deviation); `None`: there is none.
+    pub odometry: Option<f64>,
 }
 
 impl SynthSettings {
@@ -124,6 +127,7 @@ impl SynthSettings {
             seed: 0,
             jpeg_quality: 85,
             depth: true,
+            odometry: None,
         }
     }
 
@@ -139,6 +143,8 @@ pub struct SyntheticSource {
     take: Take,
     n_frames: u32,
     next_ix: u32,
+    /// `odom_from_cam` of every frame, if there is odometry.
+    odometry: Vec<Rigid>,
     /// Straightens the pictures of bent lenses.
     rectifier: Option<Rectifier>,
 }
@@ -178,7 +184,11 @@ impl SyntheticSource {
             None
         };
         let n_frames = take.settings().n_frames;
+        let noise = take.settings().odometry;
+        let track = noise.map_or_else(Vec::new, |noise| odometry::track(&take, noise));
+        let mounted = odometry::base_from_cam();
         Ok(Self {
+            odometry: track.into_iter().map(|base| base * mounted).collect(),
             take,
             n_frames,
             next_ix: 0,
@@ -212,6 +222,7 @@ impl Source for SyntheticSource {
             image: Arc::new(image),
             intrinsics,
             truth: Some(self.take.pose(ix)),
+            odometry: self.odometry.get(ix as usize).copied(),
             truth_depth: intrinsics.map(|i| Arc::new(self.take.depth(ix, &halved(i)))),
             is_held_out: false,
         })

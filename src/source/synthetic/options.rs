@@ -45,6 +45,7 @@ impl SynthSettings {
                 "exposure" => self.exposure_drift = number,
                 "blur" => self.blur = number,
                 "speed" => self.speed = number,
+                "odometry" => self.odometry = Some(number),
                 _ => self.jpeg_quality = number as u8,
             }
             return Ok(());
@@ -89,6 +90,7 @@ impl SynthSettings {
                 "exposure" => self.exposure_drift,
                 "blur" => self.blur,
                 "speed" => self.speed,
+                "odometry" => self.odometry.unwrap_or(0.0),
                 _ => f64::from(self.jpeg_quality),
             };
             if !range.allows(value) {
@@ -143,7 +145,7 @@ impl Range {
     }
 }
 
-const RANGES: [Range; 9] = [
+const RANGES: [Range; 10] = [
     Range::new(
         "frames",
         [1.0, 100_000.0],
@@ -166,6 +168,7 @@ const RANGES: [Range; 9] = [
     Range::new("noise", [0.0, 64.0], false, "8-bit levels in [0, 64]"),
     Range::new("exposure", [0.0, 4.0], false, "stops in [0, 4]"),
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
+    Range::new("odometry", [0.0, 1.0], false, "a share in [0, 1]"),
     Range::new("speed", [0.0, 100.0], false, "a number in [0, 100]"),
     Range::new("quality", [1.0, 100.0], true, "a whole number in [1, 100]"),
 ];

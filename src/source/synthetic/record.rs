@@ -17,16 +17,21 @@ use serde::Serialize;
 use crate::atomic::write_file;
 use crate::camera::{Distortion, Lens};
 use crate::frame::DepthMap;
+use crate::pose::Rigid;
+use crate::ros::odometry::Odometry;
 use crate::ros::{
-    self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped, TfMessage,
+    self, CameraInfo, CompressedImage, Header, Image, Message, Pose, PoseStamped, TfMessage,
     TransformStamped,
 };
 
+use super::odometry;
 use super::take::Take;
 use super::{SynthError, SynthSettings};
 
 const WORLD: &str = "map";
 const CAMERA: &str = "camera_optical";
+const BASE: &str = "base_link";
+const ODOM: &str = "odom";
 
 /// Depth pictures have one pixel for so many of the colour picture, along each side.
 const DEPTH_DIVISOR: u32 = 5;
@@ -168,6 +173,7 @@ fn record(
     let mut pictures = out.topic::<CompressedImage>("/camera/image_raw/compressed")?;
     let mut calibration = out.topic::<CameraInfo>("/camera/camera_info")?;
     let mut tf = out.topic::<TfMessage>("/tf")?;
+    let mut wheels = Wheels::new(take, &mut out)?;
     let mut poses = out.topic::<PoseStamped>("/ground_truth/pose")?;
     let mut depths = if take.settings().depth {
         Some(out.topic::<Image>("/camera/depth")?)
@@ -185,18 +191,13 @@ fn record(
         };
         let pose = take.pose(ix).into();
         out.write(&mut calibration, nanos, &camera_info(&lens, header(CAMERA)))?;
-        let transform = TransformStamped {
-            header: header(WORLD),
-            child_frame_id: CAMERA.to_owned(),
-            transform: pose,
-        };
-        out.write(
-            &mut tf,
-            nanos,
-            &TfMessage {
-                transforms: vec![transform],
-            },
-        )?;
+        if let Some(wheels) = &mut wheels {
+            wheels.write(&mut out, ix, nanos, header(ODOM))?;
+        } else {
+            // A frame has one parent: with wheels it is the base.
+            let message = transform(header(WORLD), CAMERA, pose);
+            out.write(&mut tf, nanos, &message)?;
+        }
         out.write(
             &mut poses,
             nanos,
@@ -222,6 +223,60 @@ fn record(
     }
     out.file.finish().map_err(|e| e.to_string())?;
     Ok(out.n_messages)
+}
+
+/// Odometry on its way into a file.
+struct Wheels {
+    track: Vec<Rigid>,
+    odometry: Topic,
+    mounted: Option<Topic>,
+}
+
+impl Wheels {
+    fn new<W: Write + Seek>(take: &Take, out: &mut Recorder<W>) -> Result<Option<Self>, String> {
+        let Some(noise) = take.settings().odometry else {
+            return Ok(None);
+        };
+        Ok(Some(Self {
+            track: odometry::track(take, noise),
+            odometry: out.topic::<Odometry>("/odom")?,
+            mounted: Some(out.topic::<TfMessage>("/tf_static")?),
+        }))
+    }
+
+    fn write<W: Write + Seek>(
+        &mut self,
+        out: &mut Recorder<W>,
+        ix: u32,
+        nanos: u64,
+        header: Header,
+    ) -> Result<(), String> {
+        if let Some(mut mounted) = self.mounted.take() {
+            let base = Header {
+                frame_id: BASE.to_owned(),
+                ..header.clone()
+            };
+            let message = transform(base, CAMERA, odometry::base_from_cam().into());
+            out.write(&mut mounted, nanos, &message)?;
+        }
+        let mut message = Odometry {
+            header,
+            child_frame_id: BASE.to_owned(),
+            ..Odometry::default()
+        };
+        message.pose.pose = self.track[ix as usize].into();
+        out.write(&mut self.odometry, nanos, &message)
+    }
+}
+
+fn transform(header: Header, child: &str, transform: Pose) -> TfMessage {
+    TfMessage {
+        transforms: vec![TransformStamped {
+            header,
+            child_frame_id: child.to_owned(),
+            transform,
+        }],
+    }
 }
 
 fn jpeg(take: &Take, ix: u32) -> Result<Vec<u8>, String> {

@@ -228,7 +228,7 @@ fn expose(light: Vec3, noise: f32, random: &mut Pcg32) -> [u8; 3] {
 }
 
 /// Standard normal by Box and Muller.
-fn gaussian(random: &mut Pcg32) -> f32 {
+pub(super) fn gaussian(random: &mut Pcg32) -> f32 {
     let radius = (-2.0 * (1.0 - random.random::<f32>()).ln()).sqrt();
     radius * (std::f32::consts::TAU * random.random::<f32>()).cos()
 }
