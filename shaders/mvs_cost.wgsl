@@ -1,20 +1,21 @@
 // mvs_cost: reference and source pictures -> matching cost of each pixel on each plane, a byte each.
 // First stage of a sweep. One workgroup per tile of 32x16 pixels and word of four planes, one thread per column of 8
-// pixels. A cost is 1 - ZNCC over the window, mean of the best two sources.
+// pixels. A cost is 1 - score: ZNCC over the window and likeness of the pixel itself, mean of the best two sources.
 
 #import sweep
 
 @group(0) @binding(0) var<uniform> sweep: Sweep;
 // The reference, then each source; -0.5 to 0.5.
 @group(0) @binding(1) var<storage, read> luma: array<f32>;
-// Of the window around each reference pixel: sum, n * variance + noise, 1/n.
+// Of the window around each reference pixel: sum, n * variance + noise, 1/n; and how far off its
+// luma may be.
 @group(0) @binding(2) var<storage, read> statistics: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> warps: array<Warp>;
 // By source and plane.
 @group(0) @binding(4) var<storage, read> starts: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> costs: array<u32>;
 
-const SWEEP_WINDOW: u32 = 7u;
+const SWEEP_WINDOW: u32 = 5u;
 const SWEEP_TILE_X: u32 = 32u;
 const SWEEP_TILE_Y: u32 = 16u;
 // Pixels of a thread, one above the other.
@@ -59,10 +60,13 @@ fn patch_pixel(tile_from: vec2<i32>, ix: u32) -> vec2<i32> {
     return tile_from + vec2<i32>(i32(ix % PATCH_X), i32(ix / PATCH_X)) - i32(SWEEP_WINDOW / 2u);
 }
 
-// Of the sums over a window, and the same window of the reference.
-fn zncc_of(sums: vec3<f32>, window: vec3<f32>) -> f32 {
+// Of the sums over a window, the same window of the reference, and the pixel in the middle of both.
+fn score_of(sums: vec3<f32>, window: vec4<f32>, own: vec2<f32>) -> f32 {
     let spread = max(sums.y - sums.x * sums.x * window.z, 0.0) + sweep.noise_variance / window.z;
-    return (sums.z - window.x * sums.x * window.z) / sqrt(window.y * spread);
+    let zncc = (sums.z - window.x * sums.x * window.z) / sqrt(window.y * spread);
+    let off = max(abs(own.y - own.x) - window.w, 0.0);
+    let like = 1.0 - min(off / sweep.most_off, 1.0);
+    return zncc + sweep.own_share * (like - max(zncc, 0.0));
 }
 
 fn cost_of(best: f32, found: f32) -> u32 {
@@ -97,7 +101,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var packed_$k = 0u;
     // Pixels outside of the picture do as the nearest one, and keep nothing.
     let at_$k = min(own + vec2<i32>(0, $k), last);
-    let window_$k = statistics[u32(at_$k.y) * sweep.width_px + u32(at_$k.x)].xyz;
+    let window_$k = statistics[u32(at_$k.y) * sweep.width_px + u32(at_$k.x)];
 #end
     for (var in_word = 0u; in_word < 4u; in_word += 1u) {
         let plane = 4u * word + in_word;
@@ -123,11 +127,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             }
             workgroupBarrier();
             // Source, source squared, source times reference: along the rows of the window, then down.
-#repeat j 14
+#repeat j 12
             var across_$j = vec3<f32>(0.0);
             {
                 let first = (row + $ju) * PATCH_X + column;
-#repeat t 7
+#repeat t 5
                 let pair_$t = patches[first + $tu];
                 across_$j += pair_$t.x * vec3<f32>(1.0, pair_$t);
 #end
@@ -136,14 +140,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #repeat k 8
             {
                 var sums = vec3<f32>(0.0);
-#repeat t 7
+#repeat t 5
                 sums += across_$[k+t];
 #end
                 // -1 where the source does not see the point.
                 let is_seen = pixel_in_source(warp, start, at_$k).z > 0.0;
-                let zncc = select(-1.0, zncc_of(sums, window_$k), is_seen);
-                second_$k = max(second_$k, min(zncc, best_$k));
-                best_$k = max(best_$k, zncc);
+                let middle = patches[(row + $ku + SWEEP_WINDOW / 2u) * PATCH_X + column + SWEEP_WINDOW / 2u];
+                let score = select(-1.0, score_of(sums, window_$k, middle), is_seen);
+                second_$k = max(second_$k, min(score, best_$k));
+                best_$k = max(best_$k, score);
             }
 #end
         }

@@ -14,6 +14,11 @@ struct Sweep {
     small_step: u32,
     noise_variance: f32,
     unseen_zncc: f32,
+    // Of a score, what the pixel itself says; and the difference of luma from which it says no.
+    own_share: f32,
+    most_off: f32,
+    padding_0: u32,
+    padding_1: u32,
 }
 
 // From reference pixels to pixels of one source, homogeneous: start of the plane + x * step_x + y * step_y.

@@ -140,6 +140,10 @@ pub struct Sweep {
     pub small_step: u32,
     pub noise_variance: f32,
     pub unseen_zncc: f32,
+    pub own_share: f32,
+    pub most_off: f32,
+    pub padding_0: u32,
+    pub padding_1: u32,
 }
 
 /// `Warp` of `shaders/lib/sweep.wgsl`.
@@ -172,7 +176,7 @@ pub const ARGS_SORT_VISIBLE: u64 = 4;
 pub const ARGS_INSTANCES: u64 = 8;
 pub const ARGS_SORT_INSTANCES: u64 = 12;
 pub const TILE_PX: u32 = 16;
-pub const SWEEP_WINDOW: u32 = 7;
+pub const SWEEP_WINDOW: u32 = 5;
 pub const SWEEP_TILE_X: u32 = 32;
 pub const SWEEP_TILE_Y: u32 = 16;
 pub const MAX_SWEEP_PLANES: u32 = 512;

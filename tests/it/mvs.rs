@@ -191,8 +191,8 @@ fn a_hall_is_measured_to_half_a_percent() {
 #[test]
 fn made_up_scenes_are_measured_to_half_a_percent_but_for_edges() {
     for (scene, bounds) in [
-        (SceneKind::Facade, [0.75, 0.02]),
-        (SceneKind::Room, [0.7, 0.055]),
+        (SceneKind::Facade, [0.8, 0.012]),
+        (SceneKind::Room, [0.72, 0.032]),
     ] {
         let settings = SynthSettings {
             width_px: 480,

@@ -194,7 +194,11 @@ fn structs_of_a_sweep_have_the_layout_of_the_host() {
         n_sources,
         small_step,
         noise_variance,
-        unseen_zncc
+        unseen_zncc,
+        own_share,
+        most_off,
+        padding_0,
+        padding_1
     );
     assert_eq!(layout_in("Sweep", &kernel("mvs_cost")), sweep);
     let warp: Layout = host_layout!(Warp, step_x, step_y, width_px, height_px, first, padding_0);

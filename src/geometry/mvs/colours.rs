@@ -156,13 +156,15 @@ mod tests {
         let colours = columns().map(|x| if POST.contains(&x) { [90; 3] } else { wall });
         let wide = POST.start - fat..POST.end + fat;
         let depth = columns().map(|x| if wide.contains(&x) { 2.0 } else { 5.0 });
+        let grey = Grey {
+            width: SIDE_PX,
+            height: SIDE_PX,
+            values: vec![0.0; SIDE_PX * SIDE_PX],
+            colours: colours.collect(),
+        };
         let prepared = Prepared {
-            grey: Grey {
-                width: SIDE_PX,
-                height: SIDE_PX,
-                values: vec![0.0; SIDE_PX * SIDE_PX],
-                colours: colours.collect(),
-            },
+            fine: grey.clone(),
+            grey,
             intrinsics: Intrinsics {
                 width_px: SIDE_PX as u32,
                 height_px: SIDE_PX as u32,

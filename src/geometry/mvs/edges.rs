@@ -2,30 +2,36 @@
 //!
 //! A matching window over the edge of a thing finds the thing also for pixels beside it, in all views alike, so that
 //! cross-view verification does not notice. Here each pixel near a jump chooses between the depths around it by a
-//! smaller window in which pixels of its own luma count most (Yoon and Kweon 2006); where no depth matches, there is
-//! none.
+//! smaller window in the finer picture, in which pixels of its own luma count most (Yoon and Kweon 2006); where no
+//! depth matches, there is none.
 
-use glam::Vec2;
+use glam::{DVec2, Vec2};
 use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::Prepared;
 use super::grey::Grey;
 use super::sweep::Warp;
-use super::zncc::{NOISE_VARIANCE, WINDOW, integer};
+use super::zncc::{MOST_OFF, NOISE_VARIANCE, WINDOW, integer};
 
 /// Relative difference of depth that is a jump.
 pub(super) const JUMP: f32 = 0.04;
 /// Reach of the matching window: pixels further from a jump are none of its business.
 const REACH: usize = WINDOW / 2;
 const RADIUS: usize = 2;
+/// From one pixel of the window to the next, in pixels of the depth map. Closer together they tell narrower things
+/// apart, and lose more where poses are off by a part of a pixel.
+const STEP_PX: f64 = 0.8;
 const SIDE: usize = 2 * RADIUS + 1;
 /// A luma difference at which a neighbour counts 1/e.
 const LIKE_LUMA: f32 = 10.0 / 255.0;
 /// Every neighbour counts this much: a lone pixel has nothing to correlate.
 const LEAST_LIKE: f32 = 0.02;
+/// Of a score, what the differences of luma say; the rest is ZNCC, to which a bright rim alone can look right. A larger
+/// share costs depth where pictures differ in brightness.
+const LUMA_SHARE: f32 = 0.5;
 /// A depth that matches worse is none.
-const MIN_ZNCC: f32 = 0.25;
+const MIN_SCORE: f32 = 0.25;
 
 /// Replaces the depths near jumps; 0 where none of those around matches.
 pub(super) fn settle(reference: &Prepared, warps: &[Warp<'_>], depth: &mut [f32]) {
@@ -74,17 +80,17 @@ fn chosen(
     [nearest, farthest]: [f32; 2],
 ) -> f32 {
     let support = Support::new(reference, at);
-    let score = |depth: f32| support.zncc(warps, at, f64::from(depth).recip());
+    let score = |depth: f32| support.score(warps, at, f64::from(depth).recip());
     let is_other = |other: &f32| *other > own * (1.0 + JUMP) || own > other * (1.0 + JUMP);
     let others = [nearest, farthest].into_iter().filter(is_other);
     let mut best = (score(own), own);
     for other in others {
-        let zncc = score(other);
-        if zncc > best.0 {
-            best = (zncc, other);
+        let found = score(other);
+        if found > best.0 {
+            best = (found, other);
         }
     }
-    if best.0 >= MIN_ZNCC { best.1 } else { 0.0 }
+    if best.0 >= MIN_SCORE { best.1 } else { 0.0 }
 }
 
 /// Neighbours of a pixel, by how much they are like it.
@@ -97,20 +103,17 @@ struct Support {
 
 impl Support {
     fn new(reference: &Prepared, [x, y]: [usize; 2]) -> Self {
-        let grey = &reference.grey;
-        let centre = grey.row(y)[x];
-        let (mut weights, mut values) = ([0.0; SIDE * SIDE], [0.0; SIDE * SIDE]);
-        for (k, (weight, value)) in weights.iter_mut().zip(&mut values).enumerate() {
-            let column = (x + k % SIDE).checked_sub(RADIUS);
-            let row = (y + k / SIDE).checked_sub(RADIUS);
-            if let (Some(column), Some(row)) = (column, row)
-                && column < grey.width
-                && row < grey.height
-            {
-                *value = grey.row(row)[column];
-                *weight = (-(*value - centre).abs() / LIKE_LUMA).exp().max(LEAST_LIKE);
-            }
-        }
+        let (grey, fine) = (&reference.grey, &reference.fine);
+        let scale = finer(grey, fine);
+        let centre = in_finer(DVec2::new(x as f64, y as f64), scale);
+        let right = Vec2::new((STEP_PX * scale.x) as f32, 0.0);
+        let down = Vec2::new(0.0, (STEP_PX * scale.y) as f32);
+        let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
+        let seen = sampled(fine, corner, right, down);
+        let values: [f32; SIDE * SIDE] = std::array::from_fn(|k| seen[k]);
+        let own = values[SIDE * SIDE / 2];
+        let like = |value: f32| (-(value - own).abs() / LIKE_LUMA).exp().max(LEAST_LIKE);
+        let mut weights = values.map(like);
         let total: f32 = weights.iter().sum();
         weights.iter_mut().for_each(|w| *w /= total);
         let mean: f32 = weights.iter().zip(&values).map(|(w, v)| w * v).sum();
@@ -128,10 +131,10 @@ impl Support {
     }
 
     /// Mean of the two sources that match best; -1 where none sees the point.
-    fn zncc(&self, warps: &[Warp<'_>], at: [usize; 2], inverse_depth: f64) -> f32 {
+    fn score(&self, warps: &[Warp<'_>], at: [usize; 2], inverse_depth: f64) -> f32 {
         let (mut best, mut second) = (-1.0_f32, -1.0_f32);
         for warp in warps {
-            let Some(found) = self.zncc_in(warp, at, inverse_depth) else {
+            let Some(found) = self.score_in(warp, at, inverse_depth) else {
                 continue;
             };
             second = second.max(found.min(best));
@@ -145,13 +148,16 @@ impl Support {
     }
 
     /// The window is small enough for the way to the source to count as affine in it.
-    fn zncc_in(&self, warp: &Warp<'_>, [x, y]: [usize; 2], inverse_depth: f64) -> Option<f32> {
+    fn score_in(&self, warp: &Warp<'_>, [x, y]: [usize; 2], inverse_depth: f64) -> Option<f32> {
         let place =
             |dx: f64, dy: f64| warp.pixel_in_source(x as f64 + dx, y as f64 + dy, inverse_depth);
+        let scale = finer(warp.source, warp.fine);
         let centre = place(0.0, 0.0)?;
-        let reach = RADIUS as f64;
-        let (right, down) = (place(reach, 0.0)? - centre, place(0.0, reach)? - centre);
-        let (width, height) = (warp.source.width as f64, warp.source.height as f64);
+        let reach = RADIUS as f64 * STEP_PX;
+        let right = (place(reach, 0.0)? - centre) * scale;
+        let down = (place(0.0, reach)? - centre) * scale;
+        let centre = in_finer(centre, scale);
+        let (width, height) = (warp.fine.width as f64, warp.fine.height as f64);
         let spread = right.abs() + down.abs();
         let (low, high) = (centre - spread, centre + spread);
         if low.x < 0.0 || low.y < 0.0 || high.x >= width - 1.0 || high.y >= height - 1.0 {
@@ -162,21 +168,40 @@ impl Support {
             down.as_vec2() / RADIUS as f32,
         );
         let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
-        let seen = sampled(warp.source, corner, right, down);
-        let mean: f32 = self.weights.iter().zip(&seen).map(|(w, v)| w * v).sum();
-        let (mut variance, mut covariance) = (NOISE_VARIANCE, 0.0);
-        for ((weight, own), other) in self.weights.iter().zip(&self.values).zip(&seen) {
+        Some(self.score_of(&sampled(warp.fine, corner, right, down)))
+    }
+
+    fn score_of(&self, seen: &[f32; LANES]) -> f32 {
+        let mean: f32 = self.weights.iter().zip(seen).map(|(w, v)| w * v).sum();
+        let (mut variance, mut covariance, mut off) = (NOISE_VARIANCE, 0.0, 0.0);
+        for ((weight, own), other) in self.weights.iter().zip(&self.values).zip(seen) {
             variance += weight * (other - mean).powi(2);
             covariance += weight * (own - self.mean) * (other - mean);
+            off += weight * (own - other).abs();
         }
-        Some(covariance / (self.variance * variance).sqrt())
+        let zncc = covariance / (self.variance * variance).sqrt();
+        let like = 1.0 - (off / MOST_OFF).min(1.0);
+        zncc + LUMA_SHARE * (like - zncc)
     }
+}
+
+/// Pixels of the finer picture to one of the depth map.
+fn finer(grey: &Grey, fine: &Grey) -> DVec2 {
+    DVec2::new(
+        fine.width as f64 / grey.width as f64,
+        fine.height as f64 / grey.height as f64,
+    )
+}
+
+/// Centres at integers on both sides.
+fn in_finer(pixel: DVec2, scale: DVec2) -> DVec2 {
+    (pixel + 0.5) * scale - 0.5
 }
 
 /// A window, filled up to whole registers.
 const LANES: usize = (SIDE * SIDE).next_multiple_of(16);
 
-/// Bilinear values of a window that lies within the picture, row by row.
+/// Bilinear values of a window, row by row. Beyond the border the outermost pixels go on.
 #[multiversion(targets("x86_64+avx2"))]
 fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES] {
     let (mut index, mut share_x, mut share_y) = ([0_u32; LANES], [0.0; LANES], [0.0; LANES]);
@@ -188,13 +213,12 @@ fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES]
     for k in 0..LANES {
         let u = corner.x + right.x * columns[k] + down.x * rows[k];
         let v = corner.y + right.y * columns[k] + down.y * rows[k];
-        // Rounding may put a corner just beyond the border.
         let (left, top) = (
             u.max(0.0).min(last[0]).floor(),
             v.max(0.0).min(last[1]).floor(),
         );
-        share_x[k] = u - left;
-        share_y[k] = v - top;
+        share_x[k] = (u - left).clamp(0.0, 1.0);
+        share_y[k] = (v - top).clamp(0.0, 1.0);
         index[k] = integer(top) * source.width as u32 + integer(left);
     }
     let [mut a, mut b, mut c, mut d] = [[0.0_f32; LANES]; 4];
@@ -209,4 +233,29 @@ fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES]
         let below = c[k] + (d[k] - c[k]) * share_x[k];
         above + (below - above) * share_y[k]
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn beyond_the_border_the_outermost_pixels_go_on() {
+        let columns = (0..64).map(|ix| (ix % 8) as f32);
+        let grey = Grey {
+            width: 8,
+            height: 8,
+            values: columns.collect(),
+            colours: Vec::new(),
+        };
+        for (corner, row) in [
+            (-2.0, [0.0, 0.0, 0.0, 1.0, 2.0]),
+            (5.0, [5.0, 6.0, 7.0, 7.0, 7.0]),
+        ] {
+            let seen = sampled(&grey, Vec2::splat(corner), Vec2::X, Vec2::Y);
+            for k in 0..SIDE * SIDE {
+                assert_eq!(seen[k], row[k % SIDE], "{corner} {k}");
+            }
+        }
+    }
 }

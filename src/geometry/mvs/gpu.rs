@@ -179,6 +179,9 @@ impl Room {
             small_step: u32::from(sgm::SMALL_STEP),
             noise_variance: zncc::NOISE_VARIANCE,
             unseen_zncc: zncc::UNSEEN_ZNCC,
+            own_share: zncc::OWN_SHARE,
+            most_off: zncc::MOST_OFF,
+            ..types::Sweep::default()
         };
         gpu.write(&self.sweep, 0, &[settings]);
         gpu.write(&self.statistics, 0, &statistics(task));
@@ -285,7 +288,7 @@ fn statistics(task: &Task<'_>) -> Vec<[f32; 4]> {
     let at = |(x, y)| y * zncc::padded(grey.width) + x;
     pixels
         .map(at)
-        .map(|ix| [of.sum[ix], of.spread[ix], of.one_over_n[ix], 0.0])
+        .map(|ix| [of.sum[ix], of.spread[ix], of.one_over_n[ix], of.slack[ix]])
         .collect()
 }
 

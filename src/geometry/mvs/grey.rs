@@ -19,8 +19,23 @@ const MAX_CELLS: usize = 1 << 27;
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
 impl Grey {
-    /// A picture whose pixels do not fit its size counts as empty.
+    /// At the size of the depth map.
     pub(super) fn of_image(image: &RgbImage, params: &MvsParams) -> Self {
+        let (width, height) = (image.width_px as usize, image.height_px as usize);
+        Self::resized(image, working_size(width, height, params))
+    }
+
+    /// Of the same picture twice the size of this, as far as the picture has it; without colours.
+    pub(super) fn finer(&self, image: &RgbImage) -> Self {
+        let width = (2 * self.width).min(image.width_px as usize);
+        let height = (2 * self.height).min(image.height_px as usize);
+        let mut finer = Self::resized(image, (width, height));
+        finer.colours = Vec::new();
+        finer
+    }
+
+    /// A picture whose pixels do not fit its size counts as empty.
+    fn resized(image: &RgbImage, (width, height): (usize, usize)) -> Self {
         let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
         let fits = from_width
             .checked_mul(from_height)
@@ -34,7 +49,6 @@ impl Grey {
                 colours: Vec::new(),
             };
         }
-        let (width, height) = working_size(from_width, from_height, params);
         let columns = shares(from_width, width);
         let rows = shares(from_height, height);
         let mut sums = vec![[0.0_f32; 3]; width];
@@ -110,4 +124,30 @@ fn shares(from: usize, into: usize) -> Vec<Share> {
             to: edge(ix + 1).min(from as f64),
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_finer_picture_shows_the_same_at_up_to_twice_the_size() {
+        let (width_px, height_px) = (32, 24);
+        let pixels = (0..3 * width_px * height_px).map(|ix| (ix * 37 % 251) as u8);
+        let image = RgbImage {
+            width_px,
+            height_px,
+            pixels: pixels.collect(),
+        };
+        let grey = Grey::resized(&image, (8, 6));
+        let finer = grey.finer(&image);
+        assert_eq!((finer.width, finer.height), (16, 12));
+        for (ix, value) in grey.values.iter().enumerate() {
+            let (x, y) = (2 * (ix % 8), 2 * (ix / 8));
+            let four = [finer.row(y), finer.row(y + 1)].map(|row| row[x] + row[x + 1]);
+            assert!((value - (four[0] + four[1]) / 4.0).abs() < 1e-5, "{ix}");
+        }
+        let full = Grey::resized(&image, (32, 24));
+        assert_eq!(full.finer(&image).values, full.values);
+    }
 }

@@ -97,6 +97,8 @@ pub fn votes(
 #[derive(Debug, Clone)]
 struct Prepared {
     grey: grey::Grey,
+    /// The same picture at up to twice the size, for what is narrower than a window.
+    fine: grey::Grey,
     intrinsics: Intrinsics,
     world_from_cam: Rigid,
 }
@@ -104,11 +106,13 @@ struct Prepared {
 impl Prepared {
     fn new(view: &MvsView, params: &MvsParams) -> Self {
         let grey = grey::Grey::of_image(&view.image, params);
+        let fine = grey.finer(&view.image);
         let intrinsics = view
             .intrinsics
             .resized(grey.width as u32, grey.height as u32);
         Self {
             grey,
+            fine,
             intrinsics,
             world_from_cam: view.world_from_cam,
         }

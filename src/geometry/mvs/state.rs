@@ -13,7 +13,7 @@ use crate::frame::DepthMap;
 use crate::gpu::GpuError;
 use crate::pose::Rigid;
 
-/// Grey pictures and raw depth of the newest keyframes: about 1 MB each at 320 pixels.
+/// Grey pictures and raw depth of the newest keyframes: up to 3 MB each at 320 pixels.
 #[derive(Debug)]
 pub struct MvsState {
     params: MvsParams,

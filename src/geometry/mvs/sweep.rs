@@ -1,7 +1,9 @@
 //! Reference and source pictures -> matching cost of each pixel on each plane of a sweep.
 //!
-//! Planes are parallel to the reference picture. A cost is 1 - ZNCC over a square window, averaged over the two
-//! sources that match best: a point hidden from some sources is still seen by two.
+//! Planes are parallel to the reference picture. A cost is 1 - score, averaged over the two sources that match
+//! best: a point hidden from some sources is still seen by two. A score is the ZNCC over a square window and, for a
+//! smaller part, how like the two pixels in its middle are (compare Mei et al., ICCV workshops 2011): a window beside
+//! the edge of a thing matches at the depth of the thing, the pixel in its middle need not.
 
 use rayon::prelude::*;
 
@@ -20,6 +22,7 @@ const MIN_TRAVEL_PX: f64 = 1.5;
 #[derive(Debug)]
 pub(super) struct Warp<'a> {
     pub(super) source: &'a Grey,
+    pub(super) fine: &'a Grey,
     /// Columns for x, y and 1. Pixel index space on both sides: centres at integers.
     pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
@@ -42,6 +45,7 @@ impl<'a> Warp<'a> {
         let corner = glam::DVec3::new((0.5 - from.cx) / from.fx, (0.5 - from.cy) / from.fy, 1.0);
         let warp = Self {
             source: &source.grey,
+            fine: &source.fine,
             pixel_map: [
                 project(rotation.x_axis / from.fx),
                 project(rotation.y_axis / from.fy),

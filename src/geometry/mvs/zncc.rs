@@ -5,8 +5,8 @@ use multiversion::multiversion;
 use super::grey::Grey;
 use super::sweep::Warp;
 
-/// Side of the matching window in pixels.
-pub(super) const WINDOW: usize = 7;
+/// Side of the matching window in pixels. A wider one makes things wider; smoothness takes care of the noise.
+pub(super) const WINDOW: usize = 5;
 const RADIUS: usize = WINDOW / 2;
 
 /// Pixels that the inner loops take at once; rows are padded to a multiple. Fixed arrays of this length and no branch
@@ -23,6 +23,12 @@ pub(super) const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
 
 /// Cost of a plane that no source sees: as bad as a ZNCC of this.
 pub(super) const UNSEEN_ZNCC: f32 = 0.2;
+
+/// Of a score, what the pixel itself says; the rest is ZNCC.
+pub(super) const OWN_SHARE: f32 = 0.3;
+
+/// A difference of luma from which on the pixel itself says no.
+pub(super) const MOST_OFF: f32 = 0.05;
 
 /// Homogeneous source pixels along one row of the reference.
 pub(super) struct WarpedRow {
@@ -41,6 +47,9 @@ pub(super) struct Statistics {
     /// n * variance + noise.
     pub(super) spread: Vec<f32>,
     pub(super) one_over_n: Vec<f32>,
+    /// How far off the luma of the pixel itself may be for its place alone: half way to its neighbours (Birchfield and
+    /// Tomasi 1998).
+    pub(super) slack: Vec<f32>,
 }
 
 impl Statistics {
@@ -50,6 +59,7 @@ impl Statistics {
             sum: vec![0.0; stride * grey.height],
             spread: vec![1.0; stride * grey.height],
             one_over_n: vec![1.0; stride * grey.height],
+            slack: vec![0.0; stride * grey.height],
         };
         for y in 0..grey.height {
             let rows = y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(grey.height);
@@ -67,10 +77,23 @@ impl Statistics {
                 all.sum[ix] = sum;
                 all.spread[ix] = (squares - sum * sum / n).max(0.0) + n * NOISE_VARIANCE;
                 all.one_over_n[ix] = 1.0 / n;
+                all.slack[ix] = slack(grey, x, y);
             }
         }
         all
     }
+}
+
+fn slack(grey: &Grey, x: usize, y: usize) -> f32 {
+    let (row, own) = (grey.row(y), grey.row(y)[x]);
+    let beside = [
+        row[x.saturating_sub(1)],
+        row[(x + 1).min(grey.width - 1)],
+        grey.row(y.saturating_sub(1))[x],
+        grey.row((y + 1).min(grey.height - 1))[x],
+    ];
+    let widest = beside.iter().fold(0.0_f32, |w, b| w.max((b - own).abs()));
+    0.5 * widest
 }
 
 /// What one source needs between rows: its last `WINDOW` warped rows.
@@ -124,7 +147,10 @@ pub(super) fn plane_costs(
                 &statistics.one_over_n[at.clone()],
             ];
             let slot = (centre % WINDOW) * stride;
-            window_zncc(of_reference, &ring.seen[slot..slot + stride], &mut scratch);
+            let own = &ring.values[slot..slot + width];
+            let slack = &statistics.slack[at.start..at.start + width];
+            likeness(reference.row(centre), own, slack, &mut scratch.likeness);
+            window_scores(of_reference, &ring.seen[slot..slot + stride], &mut scratch);
         }
         let into = &mut costs[centre * width..(centre + 1) * width];
         mean_costs(&scratch.best, &scratch.second, into);
@@ -135,6 +161,7 @@ pub(super) fn plane_costs(
 struct Scratch {
     /// Column sums with `RADIUS` zeros on both sides: source, source squared, source times reference.
     sums: [Vec<f32>; 3],
+    likeness: Vec<f32>,
     best: Vec<f32>,
     second: Vec<f32>,
 }
@@ -145,6 +172,7 @@ impl Scratch {
         let wide = || vec![0.0_f32; padded(width) + 2 * RADIUS];
         Self {
             sums: [wide(), wide(), wide()],
+            likeness: row(),
             best: row(),
             second: row(),
         }
@@ -229,19 +257,32 @@ fn column_sums(reference: &Grey, ring: &Ring, rows: std::ops::Range<usize>, scra
     }
 }
 
+/// What the pixels themselves say: 1 alike, 0 not.
+#[multiversion(targets("x86_64+avx2"))]
+fn likeness(reference: &[f32], source: &[f32], slack: &[f32], into: &mut [f32]) {
+    let pairs = reference.iter().zip(source).zip(slack);
+    for (((own, other), slack), like) in pairs.zip(into) {
+        let off = ((own - other).abs() - slack).max(0.0);
+        *like = 1.0 - (off / MOST_OFF).min(1.0);
+    }
+}
+
 /// Keeps the best two sources of every pixel of a row.
 #[multiversion(targets("x86_64+avx2"))]
-fn window_zncc(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch) {
+fn window_scores(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch) {
     let [reference_sum, reference_spread, one_over_n] =
         of_reference.map(|row| row.as_chunks::<BLOCK>().0);
     let seen = seen.as_chunks::<BLOCK>().0;
+    let likeness = scratch.likeness.as_chunks::<BLOCK>().0;
     let best = scratch.best.as_chunks_mut::<BLOCK>().0;
     let second = scratch.second.as_chunks_mut::<BLOCK>().0;
-    let blocks = best.iter_mut().zip(second).zip(seen);
+    let blocks = best.iter_mut().zip(second).zip(seen.iter().zip(likeness));
     let of_reference = reference_sum.iter().zip(reference_spread).zip(one_over_n);
     let [sum, squares, products] = &scratch.sums;
-    for (ix, (((best, second), seen), ((reference_sum, reference_spread), one_over_n))) in
-        blocks.zip(of_reference).enumerate()
+    for (
+        ix,
+        (((best, second), (seen, likeness)), ((reference_sum, reference_spread), one_over_n)),
+    ) in blocks.zip(of_reference).enumerate()
     {
         let at = ix * BLOCK;
         let (s, ss, rs) = (across(sum, at), across(squares, at), across(products, at));
@@ -250,9 +291,10 @@ fn window_zncc(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch) {
             let spread = (ss[x] - s[x] * s[x] * share).max(0.0) + NOISE_VARIANCE / share;
             let zncc =
                 (rs[x] - reference_sum[x] * s[x] * share) / (reference_spread[x] * spread).sqrt();
-            let zncc = if seen[x] > 0.0 { zncc } else { -1.0 };
-            second[x] = second[x].max(zncc.min(best[x]));
-            best[x] = best[x].max(zncc);
+            let score = zncc + OWN_SHARE * (likeness[x] - zncc.max(0.0));
+            let score = if seen[x] > 0.0 { score } else { -1.0 };
+            second[x] = second[x].max(score.min(best[x]));
+            best[x] = best[x].max(score);
         }
     }
 }
@@ -263,10 +305,7 @@ fn across(row: &[f32], at: usize) -> Block {
     let mut sums = [0.0; BLOCK];
     if let Some(row) = row[at..].first_chunk::<{ BLOCK + 2 * RADIUS }>() {
         for x in 0..BLOCK {
-            sums[x] = (row[x] + row[x + 1])
-                + (row[x + 2] + row[x + 3])
-                + (row[x + 4] + row[x + 5])
-                + row[x + 6];
+            sums[x] = (row[x] + row[x + 1]) + (row[x + 2] + row[x + 3]) + row[x + 4];
         }
     }
     sums
