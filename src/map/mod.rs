@@ -5,6 +5,7 @@
 
 pub mod align;
 pub mod checkpoint;
+pub mod correction;
 mod depth_scale;
 mod gauge;
 mod growth;
@@ -16,6 +17,7 @@ mod metric;
 mod revise;
 pub mod schedule;
 pub mod seed;
+pub mod slew;
 pub mod snapshot;
 mod transient;
 mod views;
@@ -30,6 +32,7 @@ use crate::config::MapParams;
 use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
+use crate::map::correction::Correction;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
@@ -64,6 +67,8 @@ pub struct SplatMap {
     /// `None` before views were placed.
     gauge: Option<Gauge>,
     n_put_back: u64,
+    /// Not yet asked for.
+    correction: Option<Correction>,
     /// Share of the input that has come, while more is to come and where it is known.
     progress: Option<f64>,
     scale: Scale,
@@ -102,6 +107,7 @@ impl SplatMap {
             pose_error: [0.0; 2],
             gauge: None,
             n_put_back: 0,
+            correction: None,
             progress: None,
             scale,
             scale_params: None,

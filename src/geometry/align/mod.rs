@@ -5,9 +5,12 @@
 
 mod agreeing;
 pub mod bundle_state;
+mod closing;
 pub mod depth_bundle;
 pub mod epipolar;
 mod line_distance;
+mod link;
+mod loops;
 pub mod matches;
 pub mod noise;
 mod overlap;
@@ -127,6 +130,12 @@ impl Aligner {
         let refined = self.refine(&mut window, pictures, given);
         let mut joined = self.windows.join(window);
         if self.params.method == AlignMethod::Off {
+            if self.params.loops {
+                self.matcher.look(&joined.views, pictures);
+                let fresh = joined.views.iter().filter(|view| joined.is_new(view));
+                let fresh: Vec<View> = fresh.cloned().collect();
+                self.correct_whole(&fresh, given, &mut joined);
+            }
             joined.note = joined.note.or(lost);
             return joined;
         }
@@ -155,6 +164,9 @@ impl Aligner {
     /// What all keyframes say together, once no more will come.
     pub fn finish(&mut self) -> Vec<Revision> {
         let mut revised = Vec::new();
+        if self.params.method == AlignMethod::Off {
+            return revised;
+        }
         for component in self.whole.changed() {
             let found = self
                 .whole
@@ -174,14 +186,20 @@ impl Aligner {
         }
         self.whole
             .add(fresh, &self.matcher, given, self.params.whole);
-        if !self.whole.is_due(component) {
-            return;
+        let ids: Vec<u32> = fresh.iter().map(|v| v.keyframe_id).collect();
+        let mut correction = None;
+        if self.params.loops {
+            let (whole, matcher) = (&mut self.whole, &mut self.matcher);
+            correction = whole.close_loop(&ids, matcher, &self.params);
         }
-        if let Some(correction) = self
-            .whole
-            .correct(component, &mut self.matcher, &self.params)
-        {
+        let is_due = self.params.method != AlignMethod::Off && self.whole.is_due(component);
+        if correction.is_none() && is_due {
+            let (whole, matcher) = (&mut self.whole, &mut self.matcher);
+            correction = whole.correct(component, matcher, &self.params);
+        }
+        if let Some(correction) = correction {
             self.windows.revise(&correction, joined);
+            joined.is_loop = correction.is_loop;
             joined.revised = correction.revised;
         }
     }
