@@ -119,7 +119,7 @@ struct LocaliseArgs {
 
 #[derive(Debug, Args)]
 struct SynthArgs {
-    /// room, facade or corridor
+    /// room, facade, corridor or hallway
     scene: String,
     /// Recording to write; its poses go beside it as .tum
     #[arg(long, value_name = "FILE.mcap")]

@@ -3,9 +3,12 @@
 //! The only part that knows the map frame. Owns the engine; reads back from it only when a batch comes, at
 //! intervals of many steps, and for snapshots.
 
+mod ab;
 pub mod align;
 pub mod checkpoint;
+mod contradicted;
 pub mod correction;
+mod covisible;
 mod depth_scale;
 mod gauge;
 mod growth;
@@ -17,6 +20,7 @@ mod metric;
 mod revise;
 pub mod schedule;
 pub mod seed;
+mod settle;
 pub mod slew;
 pub mod snapshot;
 mod transient;
@@ -36,6 +40,7 @@ use crate::map::correction::Correction;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
+use crate::map::settle::Settling;
 use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::splat::{Engine, PoseStep, StepSettings, TrainingView};
 
@@ -80,6 +85,9 @@ pub struct SplatMap {
     loss_curve: Vec<(u64, f64)>,
     /// Steps between points of the curve.
     note_every: u64,
+    settling: Settling,
+    /// Views that see what the newest see, without those.
+    covisible: Vec<usize>,
 }
 
 impl std::fmt::Debug for SplatMap {
@@ -117,6 +125,8 @@ impl SplatMap {
             n_steps: 0,
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
+            settling: Settling::default(),
+            covisible: Vec::new(),
         }
     }
 
@@ -159,7 +169,8 @@ impl SplatMap {
             self.progress = None;
         }
         for done in 0..n {
-            let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
+            let views = (&self.trainable[..], &self.covisible[..]);
+            let Some(view_ix) = self.schedule.next_view(views, phase) else {
                 return done;
             };
             let settings = self.step_settings(phase);
@@ -365,6 +376,13 @@ impl SplatMap {
         }
         self.measure_scene();
         self.prune();
+        if !fresh.is_empty() {
+            self.unsettle();
+            self.find_covisible();
+        }
+        if ab::on("CONTRA") {
+            self.remove_contradicted(&fresh);
+        }
         for id in &fresh {
             self.seed_from(*id, false);
         }
@@ -381,22 +399,6 @@ impl SplatMap {
         medians.sort_by(f32::total_cmp);
         if let Some(median) = medians.get(medians.len() / 2) {
             self.scene_depth = *median;
-        }
-    }
-
-    fn note_loss(&mut self) {
-        let stats = self.engine.take_stats();
-        if stats.n_steps > 0 {
-            self.loss_curve.push((self.n_steps, stats.loss));
-        }
-        // A live run has no end: half the points at twice the distance show the same curve.
-        if self.loss_curve.len() > MAX_CURVE {
-            let mut odd = false;
-            self.loss_curve.retain(|_| {
-                odd = !odd;
-                odd
-            });
-            self.note_every *= 2;
         }
     }
 }

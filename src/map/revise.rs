@@ -46,6 +46,9 @@ impl SplatMap {
                 motions.extend(motion.map(|motion| (id, (motion, old.translation))));
             }
         }
+        if !motions.is_empty() {
+            self.unsettle();
+        }
         self.carry(&motions);
         let own = self.component;
         let ids = self.keyframes.foreign.iter();
@@ -98,8 +101,15 @@ impl SplatMap {
             self.engine.set_intrinsics(placed.view_ix, &intrinsics);
         }
         let model_motion = revision.batch_from_cam * placed.model_from_cam.inverse();
+        let kept = map_from_model
+            .transform_pose(&placed.model_from_cam)
+            .inverse()
+            * *old;
         placed.model_from_cam = revision.batch_from_cam;
-        let new = map_from_model.transform_pose(&revision.batch_from_cam);
+        let mut new = map_from_model.transform_pose(&revision.batch_from_cam);
+        if crate::map::ab::on("KEEP") {
+            new = new * kept;
+        }
         let moved = (new.translation - old.translation).length() / f64::from(self.scene_depth);
         let scale = revision.depth_factor * unit;
         let turned = model_motion.angle_to(&Rigid::IDENTITY);
@@ -202,6 +212,7 @@ impl SplatMap {
             self.keyframes.waiting.insert(id, placed.keyframe);
         }
         self.trainable.clear();
+        self.covisible.clear();
         self.gauge = None;
         self.schedule.restart_round();
         self.component = Some(component);

@@ -19,8 +19,8 @@ use crate::source::{Source, SourceCounts};
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
-/// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
-const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
+/// Live: steps that a keyframe is worth at most; the optimiser rests when the loss no longer falls or all are spent.
+const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 
 /// Input -> frames.
 pub(super) struct SourceStage {
@@ -220,6 +220,9 @@ impl MapStage {
         &mut self,
         publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
     ) -> bool {
+        if self.map.is_settled() {
+            return false;
+        }
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
         let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();

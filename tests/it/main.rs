@@ -8,6 +8,7 @@
 mod alignment;
 mod backends;
 mod bags;
+mod corrections;
 mod declared_lengths;
 mod engine;
 mod eval;
@@ -29,6 +30,7 @@ mod known;
 mod layers;
 mod lenses;
 mod localise;
+mod loops;
 mod lpips;
 mod mcmc;
 mod metres;

@@ -10,7 +10,7 @@ use super::loops::{Kept, correction};
 use super::matches::Matcher;
 use super::tracks::{Track, covering_tracks};
 use super::whole::{Correction, TRACKS_PER_VIEW, Whole, score};
-use crate::config::align::{AlignMethod, AlignParams};
+use crate::config::align::AlignParams;
 use crate::geometry::View;
 use crate::geometry::pose_graph::{Graph, Tie};
 use crate::pose::{Rigid, Similarity};
@@ -53,9 +53,7 @@ impl Whole {
                 .for_each(|l| matcher.remember(l.ends(), &self.views, params.max_matches));
             self.closed.extend(links.iter().map(Link::ends));
             self.merge_counts(sides);
-            if params.method != AlignMethod::Off {
-                self.correct(sides[0].min(sides[1]), matcher, params);
-            }
+            self.correct(sides[0].min(sides[1]), matcher, params);
         }
         let score_after = self.score_of(&ids, &way, matcher, params);
         let is_good = is_bent && score_after >= MIN_LEFT * score_before;

@@ -183,7 +183,7 @@ impl Matcher {
         }
     }
 
-    pub(super) fn look(&mut self, views: &[View], pictures: &BTreeMap<u32, Arc<RgbImage>>) {
+    fn look(&mut self, views: &[View], pictures: &BTreeMap<u32, Arc<RgbImage>>) {
         let fresh: Vec<(u32, &Arc<RgbImage>)> = views
             .iter()
             .filter(|view| !self.held.contains_key(&view.keyframe_id))

@@ -130,12 +130,6 @@ impl Aligner {
         let refined = self.refine(&mut window, pictures, given);
         let mut joined = self.windows.join(window);
         if self.params.method == AlignMethod::Off {
-            if self.params.loops {
-                self.matcher.look(&joined.views, pictures);
-                let fresh = joined.views.iter().filter(|view| joined.is_new(view));
-                let fresh: Vec<View> = fresh.cloned().collect();
-                self.correct_whole(&fresh, given, &mut joined);
-            }
             joined.note = joined.note.or(lost);
             return joined;
         }
@@ -164,9 +158,6 @@ impl Aligner {
     /// What all keyframes say together, once no more will come.
     pub fn finish(&mut self) -> Vec<Revision> {
         let mut revised = Vec::new();
-        if self.params.method == AlignMethod::Off {
-            return revised;
-        }
         for component in self.whole.changed() {
             let found = self
                 .whole
@@ -192,8 +183,7 @@ impl Aligner {
             let (whole, matcher) = (&mut self.whole, &mut self.matcher);
             correction = whole.close_loop(&ids, matcher, &self.params);
         }
-        let is_due = self.params.method != AlignMethod::Off && self.whole.is_due(component);
-        if correction.is_none() && is_due {
+        if correction.is_none() && self.whole.is_due(component) {
             let (whole, matcher) = (&mut self.whole, &mut self.matcher);
             correction = whole.correct(component, matcher, &self.params);
         }

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use glam::DVec3;
 
 use super::Limits;
-use super::adjusting::adjust_global;
+use super::adjusting::{adjust_global, adjust_local};
 use super::landmarks::{extend, join};
 use super::links::{pair_seed, release};
 use super::merging::similarity;
@@ -62,7 +62,7 @@ pub(super) fn release_waiting(scene: &mut Scene) {
 /// Uses the held links that fit and closes a loop if there is one. `max_drift` as in `align.max_drift`; `None`: no loops.
 pub(super) fn settle(scene: &mut Scene, limits: &Limits, max_drift: Option<f64>) -> bool {
     let held: Vec<(usize, usize)> = scene.held.keys().copied().collect();
-    let mut open = Vec::new();
+    let (mut open, mut used) = (Vec::new(), BTreeSet::new());
     for ends in held {
         let components = [scene.component_of(ends.0), scene.component_of(ends.1)];
         if components[0].is_none() || components[1].is_none() || components[0] != components[1] {
@@ -70,10 +70,13 @@ pub(super) fn settle(scene: &mut Scene, limits: &Limits, max_drift: Option<f64>)
         } else if max_drift.is_some() && fits(scene, ends, 2.0 * limits.max_error_px) {
             release(scene, ends);
             extend(scene, ends.1, limits.max_error_px);
+            used.insert(ends.1);
         } else {
             open.push(ends);
         }
     }
+    used.into_iter()
+        .for_each(|shot| adjust_local(scene, shot, limits));
     let mut found = Vec::new();
     if let Some(max_drift) = max_drift {
         let candidates = open.iter().filter_map(|e| candidate(scene, *e, limits));
