@@ -8,7 +8,6 @@ pub mod align;
 pub mod checkpoint;
 mod contradicted;
 pub mod correction;
-mod covisible;
 mod depth_scale;
 mod gauge;
 mod growth;
@@ -86,8 +85,6 @@ pub struct SplatMap {
     /// Steps between points of the curve.
     note_every: u64,
     settling: Settling,
-    /// Views that see what the newest see, without those.
-    covisible: Vec<usize>,
 }
 
 impl std::fmt::Debug for SplatMap {
@@ -126,7 +123,6 @@ impl SplatMap {
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
             settling: Settling::default(),
-            covisible: Vec::new(),
         }
     }
 
@@ -169,8 +165,7 @@ impl SplatMap {
             self.progress = None;
         }
         for done in 0..n {
-            let views = (&self.trainable[..], &self.covisible[..]);
-            let Some(view_ix) = self.schedule.next_view(views, phase) else {
+            let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
                 return done;
             };
             let settings = self.step_settings(phase);
@@ -378,7 +373,6 @@ impl SplatMap {
         self.prune();
         if !fresh.is_empty() {
             self.unsettle();
-            self.find_covisible();
         }
         if ab::on("CONTRA") {
             self.remove_contradicted(&fresh);

@@ -101,15 +101,8 @@ impl SplatMap {
             self.engine.set_intrinsics(placed.view_ix, &intrinsics);
         }
         let model_motion = revision.batch_from_cam * placed.model_from_cam.inverse();
-        let kept = map_from_model
-            .transform_pose(&placed.model_from_cam)
-            .inverse()
-            * *old;
         placed.model_from_cam = revision.batch_from_cam;
-        let mut new = map_from_model.transform_pose(&revision.batch_from_cam);
-        if crate::map::ab::on("KEEP") {
-            new = new * kept;
-        }
+        let new = map_from_model.transform_pose(&revision.batch_from_cam);
         let moved = (new.translation - old.translation).length() / f64::from(self.scene_depth);
         let scale = revision.depth_factor * unit;
         let turned = model_motion.angle_to(&Rigid::IDENTITY);
@@ -212,7 +205,6 @@ impl SplatMap {
             self.keyframes.waiting.insert(id, placed.keyframe);
         }
         self.trainable.clear();
-        self.covisible.clear();
         self.gauge = None;
         self.schedule.restart_round();
         self.component = Some(component);

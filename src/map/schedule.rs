@@ -7,11 +7,10 @@ use rand_pcg::Pcg64Mcg;
 use crate::config::{DepthLoss, MapParams, PoseRefinement};
 use crate::splat::{DepthMode, PoseStep, StepSettings};
 
-/// Shares of the steps between arrivals that train on the newest views, and on others that see the same.
-const NEWEST_SHARE: f64 = 0.4;
-const COVISIBLE_SHARE: f64 = 0.4;
+/// Share of the steps between arrivals that train on the newest views.
+const NEWEST_SHARE: f64 = 0.5;
 /// Views that count as newest: about one batch.
-pub(super) const N_NEWEST: usize = 8;
+const N_NEWEST: usize = 8;
 /// Rates at the last step, as a share of those at the first.
 const FINAL_MEAN_RATE: f32 = 0.01;
 const FINAL_POSE_RATE: f32 = 0.03;
@@ -50,27 +49,11 @@ impl Schedule {
         }
     }
 
-    /// One of the trainable views, which are in order of arrival; `None` without any. Of the others, `covisible` see
-    /// what the newest see.
-    pub fn next_view(
-        &mut self,
-        (trainable, covisible): (&[usize], &[usize]),
-        phase: Phase,
-    ) -> Option<usize> {
+    /// One of `trainable`, which is in order of arrival; `None` when it is empty.
+    pub fn next_view(&mut self, trainable: &[usize], phase: Phase) -> Option<usize> {
         let newest = trainable.len().saturating_sub(N_NEWEST);
-        if phase == Phase::Streaming && newest > 0 {
-            let (a, b) = if crate::map::ab::on("CO") {
-                (NEWEST_SHARE, COVISIBLE_SHARE)
-            } else {
-                (0.5, 0.0)
-            };
-            let draw: f64 = self.rng.random();
-            if draw < a {
-                return Some(trainable[self.rng.random_range(newest..trainable.len())]);
-            }
-            if draw < a + b && !covisible.is_empty() {
-                return Some(covisible[self.rng.random_range(0..covisible.len())]);
-            }
+        if phase == Phase::Streaming && newest > 0 && self.rng.random_bool(NEWEST_SHARE) {
+            return Some(trainable[self.rng.random_range(newest..trainable.len())]);
         }
         if self.round.is_empty() {
             self.round = trainable.to_vec();
@@ -176,11 +159,11 @@ mod tests {
         let views: Vec<usize> = (3..20).collect();
         let mut drawn: Vec<usize> = views
             .iter()
-            .filter_map(|_| schedule.next_view((&views, &[]), Phase::Final(0.5)))
+            .filter_map(|_| schedule.next_view(&views, Phase::Final(0.5)))
             .collect();
         drawn.sort_unstable();
         assert_eq!(drawn, views);
-        assert_eq!(schedule.next_view((&[], &[]), Phase::Final(0.9)), None);
+        assert_eq!(schedule.next_view(&[], Phase::Final(0.9)), None);
     }
 
     #[test]
@@ -189,7 +172,7 @@ mod tests {
         let views: Vec<usize> = (0..80).collect();
         let draws = 1000;
         let newest = (0..draws)
-            .filter_map(|_| schedule.next_view((&views, &[]), Phase::Streaming))
+            .filter_map(|_| schedule.next_view(&views, Phase::Streaming))
             .filter(|v| *v >= 72)
             .count();
         // Half by preference, a tenth of the other half by chance.

@@ -51,30 +51,9 @@ pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rn
     let (width, height) = (view.image.width_px as usize, view.image.height_px as usize);
     let filled = view.fills_gaps.then(|| fill_gaps(view.depth));
     let detail = detail(view.image);
-    let shown = view
-        .rendering
-        .filter(|_| crate::map::ab::on("LAP"))
-        .map(|rendering| {
-            let pixels = rendering
-                .rgb
-                .iter()
-                .map(|c| (c * 255.0).clamp(0.0, 255.0) as u8);
-            RgbImage {
-                width_px: rendering.width_px,
-                height_px: rendering.height_px,
-                pixels: pixels.collect(),
-            }
-        });
-    let missing = shown.map(|shown| deficit(view.image, &shown));
     let weights: Vec<f32> = (0..width * height)
         .map(|p| match depth_at(view, filled.as_deref(), p) {
-            Some((depth, is_verified)) => {
-                let need = need(view, p, depth, is_verified);
-                let missing = missing
-                    .as_ref()
-                    .map_or(0.0, |m| if is_verified { m[p] } else { 0.0 });
-                need.max(missing) * detail[p]
-            }
+            Some((depth, is_verified)) => need(view, p, depth, is_verified) * detail[p],
             None => 0.0,
         })
         .collect();
@@ -155,43 +134,6 @@ fn need(view: &SeedView<'_>, p: usize, depth: f32, is_verified: bool) -> f32 {
         .sum::<f32>()
         / 3.0;
     ((error - ERROR_FROM) / (ERROR_FULL - ERROR_FROM)).clamp(0.0, 1.0)
-}
-
-/// How much detail of the picture the map lacks, 0 to 1: the difference of both Laplacians (Meuleman 2025), blurred.
-fn deficit(image: &RgbImage, shown: &RgbImage) -> Vec<f32> {
-    let (width, height) = (image.width_px as usize, image.height_px as usize);
-    let laplacian = |image: &RgbImage| {
-        let grey: Vec<f32> = image
-            .pixels
-            .chunks_exact(3)
-            .map(|p| (f32::from(p[0]) + 2.0 * f32::from(p[1]) + f32::from(p[2])) / 1020.0)
-            .collect();
-        let at = |x: usize, y: usize| grey[y.min(height - 1) * width + x.min(width - 1)];
-        let of = |p: usize| {
-            let (x, y) = (p % width, p / width);
-            let (left, up) = (x.saturating_sub(1), y.saturating_sub(1));
-            let around = at(x + 1, y) + at(left, y) + at(x, y + 1) + at(x, up);
-            (around - 4.0 * at(x, y)).abs()
-        };
-        let sharp: Vec<f32> = (0..width * height).map(of).collect();
-        let mean = |p: usize| {
-            let (x, y) = (p % width, p / width);
-            let (mut sum, mut n) = (0.0, 0.0);
-            for near_y in y.saturating_sub(2)..(y + 3).min(height) {
-                for near_x in x.saturating_sub(2)..(x + 3).min(width) {
-                    sum += sharp[near_y * width + near_x];
-                    n += 1.0;
-                }
-            }
-            sum / n
-        };
-        (0..width * height).map(mean).collect::<Vec<f32>>()
-    };
-    let (wanted, found) = (laplacian(image), laplacian(shown));
-    let missing = wanted.iter().zip(&found);
-    missing
-        .map(|(w, f)| (2.0 * (w - f)).clamp(0.0, 1.0))
-        .collect()
 }
 
 /// Local contrast of each pixel, mean about 1.

@@ -32,6 +32,15 @@ const N_SEEDS: u64 = 10;
 /// First and last keyframes, between which the lap is closed.
 const SEAM: u32 = 10;
 
+/// Twice what docs/ALIGNMENT.md is measured with.
+const ROUGH: Noise = Noise {
+    scale: 1.25,
+    rotation_deg: 2.0,
+    translation: 0.04,
+    depth: 0.1,
+    outliers: 0.05,
+};
+
 /// Keyframes with what is true of them.
 pub(crate) struct Filmed {
     pub(crate) views: Vec<View>,
@@ -117,7 +126,7 @@ fn judged(filmed: &Filmed, poses: &BTreeMap<u32, (u32, Rigid)>, n_loops: usize) 
 fn windows(
     filmed: &Filmed,
     params: &AlignParams,
-    max_features: usize,
+    (max_features, noise): (usize, &Noise),
     seed: u64,
     breaks: &[usize],
 ) -> Found {
@@ -132,11 +141,7 @@ fn windows(
     {
         let from = if breaks.contains(&n) { from + 2 } else { from };
         let range = from..(from / 6 * 6 + 8).min(filmed.views.len());
-        let window = answer(
-            &filmed.views[range.clone()],
-            &Noise::STATED,
-            seed << 20 | n as u64,
-        );
+        let window = answer(&filmed.views[range.clone()], noise, seed << 20 | n as u64);
         let pictures: BTreeMap<u32, Arc<RgbImage>> = filmed.keyframes[range]
             .iter()
             .map(|k| (k.id, Arc::clone(&k.frame.image)))
@@ -193,24 +198,24 @@ const CORRIDOR: &str = "corridor?frames=232&speed=0.56&width=192&height=144";
 fn a_loop_of_windows_takes_most_of_the_drift() {
     let filmed = film(CORRIDOR, 2);
     let base = params(&[]).align;
-    let run = |loops: bool, history: usize, max_features: usize| {
+    let run = |loops: bool, noise: &Noise, seed: u64| {
         let params = AlignParams {
             loops,
-            history,
+            depth_error: noise.depth,
             ..base.clone()
         };
-        windows(&filmed, &params, max_features, 1, &[])
+        windows(&filmed, &params, (300, noise), seed, &[])
     };
-    // With few features and nothing that reaches back, the way drifts farther than two views share surface.
-    for (history, max_features) in [(base.history, 500), (0, 200)] {
-        let without = run(false, history, max_features);
-        let with = run(true, history, max_features);
-        eprintln!("{history}, {max_features}: {without:?} -> {with:?}");
+    let (mut before, mut after) = (0.0, 0.0);
+    for (noise, seed) in [(&Noise::STATED, 1), (&ROUGH, 2)] {
+        let (without, with) = (run(false, noise, seed), run(true, noise, seed));
+        eprintln!("{noise:?}: {without:?} -> {with:?}");
         assert_eq!(without.n_loops, 0);
         assert!(with.n_loops > 0 && with.n_components == 1, "{with:?}");
-        let left = with.ate_percent / without.ate_percent;
-        assert!(left <= MAX_LEFT, "{left:.2} of the error is left");
+        (before, after) = (before + without.ate_percent, after + with.ate_percent);
     }
+    let left = after / before;
+    assert!(left <= MAX_LEFT, "{left:.2} of the error is left");
 }
 
 #[test]
@@ -222,7 +227,7 @@ fn a_component_that_sees_a_known_place_joins_it() {
             loops,
             ..base.clone()
         };
-        windows(&filmed, &params, 500, 1, &[9])
+        windows(&filmed, &params, (500, &Noise::STATED), 1, &[9])
     };
     let (without, with) = (run(false), run(true));
     eprintln!("broken: {without:?} -> {with:?}");
@@ -235,8 +240,14 @@ fn a_component_that_sees_a_known_place_joins_it() {
 fn bays_that_are_all_alike_are_no_loop_for_windows() {
     let filmed = film("hallway?frames=150&width=192&height=144", 2);
     let base = params(&[]).align;
+    let without = AlignParams {
+        loops: false,
+        ..base.clone()
+    };
+    let found = windows(&filmed, &without, (500, &Noise::STATED), 0, &[]);
+    eprintln!("hallway without loops: {found:?}");
     for seed in 0..N_SEEDS {
-        let found = windows(&filmed, &base, 500, seed, &[]);
+        let found = windows(&filmed, &base, (500, &Noise::STATED), seed, &[]);
         eprintln!("hallway {seed}: {found:?}");
         assert_eq!(found.n_loops, 0, "seed {seed}");
         assert!(found.ate_percent < 3.0, "seed {seed}: {found:?}");
@@ -265,6 +276,7 @@ fn bays_that_are_all_alike_are_no_loop_for_pictures_alone() {
         let found = sfm(&filmed, &["sfm.max_features=500"], seed);
         eprintln!("hallway {seed}: {found:?}");
         assert_eq!(found.n_loops, 0, "seed {seed}");
+        assert!(found.n_placed > 20, "seed {seed}: {found:?}");
         assert!(
             found.n_components > 1 || found.ate_percent < 3.0,
             "seed {seed}: {found:?}"

@@ -1,7 +1,7 @@
 //! A new keyframe -> links to places that were seen long before, each checked by pixels, depth and its neighbours.
 //!
 //! Places that look alike are no rarer than places seen again, so a link is believed only if (1) keyframes beside both
-//! ends say the same, (2) no other place fits about as well, and (3) it asks for no larger a drift than the way between
+//! ends say the same, (2) no other place fits about as well, poses as they are included, and (3) it asks for no larger a drift than the way between
 //! may have gathered: a corridor of equal doors asks for as much as was walked.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -23,7 +23,7 @@ pub(super) const MIN_GAP: u32 = 20;
 /// Matching signatures below which two pictures do not look alike.
 const MIN_VOTES: usize = 6;
 /// Places that a keyframe is compared with, and how many keyframes one place takes.
-const N_PLACES: usize = 5;
+const N_PLACES: usize = 8;
 const PLACE: u32 = 3;
 /// Neighbours of both ends that are asked, to each side.
 const N_BESIDE: usize = 2;
@@ -116,20 +116,23 @@ impl Loops {
         found.sort_by_key(|b| (std::cmp::Reverse(b.link.n), b.link.older));
         let mut rest = found.into_iter();
         let best = rest.next()?;
+        // One that no drift explains is a rival all the same: the place looks like others.
         let rival = rest.find(|b| !is_same(kept, id, &b.correction, &best.correction));
         let is_rivalled = rival
             .as_ref()
             .is_some_and(|r| r.link.n as f64 > RIVAL * best.link.n as f64);
+        let is_plausible = is_plausible(kept, &best, params.max_drift);
         let needed = is_needed(kept, &best);
         tracing::debug!(
             id,
             older = best.link.older,
             n = best.link.n,
             is_rivalled,
+            is_plausible,
             needed,
             "seen again"
         );
-        (!is_rivalled && needed).then_some(best)
+        (!is_rivalled && is_plausible && needed).then_some(best)
     }
 
     fn checked(
@@ -144,8 +147,7 @@ impl Loops {
         }
         let link = link(kept, matcher, ends, params)?;
         let correction = correction(kept, &link)?;
-        let best = Best { link, correction };
-        is_plausible(kept, &best, params.max_drift).then_some(best)
+        Some(Best { link, correction })
     }
 }
 

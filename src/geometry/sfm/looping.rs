@@ -24,6 +24,8 @@ const MIN_NAMED: usize = 15;
 const MIN_FITTING: f64 = 0.5;
 /// Shots that a link may wait for others that say the same.
 const MAX_WAIT: usize = 24;
+/// Shots in between from which on a place is seen again.
+const MIN_GAP: usize = 20;
 const MIN_LINKS: usize = 2;
 /// What links may differ in: share of the depth, radians, logarithm of scale.
 const SAME: [f64; 3] = [0.2, 0.07, 0.15];
@@ -70,19 +72,30 @@ pub(super) fn settle(scene: &mut Scene, limits: &Limits, max_drift: Option<f64>)
         } else if max_drift.is_some() && fits(scene, ends, 2.0 * limits.max_error_px) {
             release(scene, ends);
             extend(scene, ends.1, limits.max_error_px);
-            used.insert(ends.1);
+            used.insert(ends);
         } else {
             open.push(ends);
         }
     }
-    used.into_iter()
+    let newers: BTreeSet<usize> = used.iter().map(|e| e.1).collect();
+    newers
+        .into_iter()
         .for_each(|shot| adjust_local(scene, shot, limits));
-    let mut found = Vec::new();
+    // Where one far place fits as the poses are, another that asks for a correction only looks alike.
+    let far = used.iter().filter(|e| e.0 + MIN_GAP <= e.1);
+    let settled: BTreeSet<usize> = far.map(|e| e.1).collect();
+    let (mut found, mut is_closed) = (Vec::new(), false);
     if let Some(max_drift) = max_drift {
-        let candidates = open.iter().filter_map(|e| candidate(scene, *e, limits));
-        found.extend(candidates.filter(|c| is_plausible(scene, c, max_drift)));
+        let asking = open.iter().filter(|e| !settled.contains(&e.1));
+        found.extend(asking.filter_map(|e| candidate(scene, *e, limits)));
+        let plausible = |c: &&Candidate| is_plausible(scene, c, max_drift);
+        let best = found
+            .iter()
+            .filter(plausible)
+            .max_by_key(|c| (c.pairs.len(), c.ends));
+        let links = best.and_then(|best| agreeing(scene, &found, best));
+        is_closed = links.is_some_and(|all| close(scene, &all, limits));
     }
-    let is_closed = agreeing(scene, &found).is_some_and(|all| close(scene, &all, limits));
     let newest = scene.shots.len();
     let keeps = |ends: &(usize, usize)| max_drift.is_some() && ends.1 + MAX_WAIT > newest;
     scene.held.retain(|ends, _| keeps(ends));
@@ -154,9 +167,13 @@ fn is_plausible(scene: &Scene, candidate: &Candidate, max_drift: f64) -> bool {
         && correction.scale.ln().abs() <= MAX_SCALE
 }
 
-/// Links that say the same as the one with most landmarks, if they are enough and none of its shot speaks against it.
-fn agreeing<'a>(scene: &Scene, found: &'a [Candidate]) -> Option<Vec<&'a Candidate>> {
-    let best = found.iter().max_by_key(|c| (c.pairs.len(), c.ends))?;
+/// Links that say the same as the one with most landmarks, if they are enough and no other speaks against it; one that no
+/// drift explains does, too: the place looks like others.
+fn agreeing<'a>(
+    scene: &Scene,
+    found: &'a [Candidate],
+    best: &Candidate,
+) -> Option<Vec<&'a Candidate>> {
     let is_same = |c: &&Candidate| {
         let (Some(centre), depth) = (scene.centre(c.ends.1), depth(scene, c.ends.1)) else {
             return false;
