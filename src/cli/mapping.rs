@@ -68,15 +68,16 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     stop_on_ctrl_c(&stop)?;
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
+    let told = &found.tracking;
     if args.json {
         say(serde_json::to_string_pretty(&found)?);
     } else {
         say(format!(
             "{} of {} frames found among {} keyframes, {} times lost, {} times found again",
-            found.tracked, found.frames, found.map_keyframes, found.lost, found.relocalised
+            told.tracked, told.frames, found.map_keyframes, told.lost, told.relocalised
         ));
     }
-    if found.tracked == 0 {
+    if told.tracked == 0 {
         let reason = found
             .reason
             .unwrap_or_else(|| "there are no frames".to_owned());

@@ -54,8 +54,13 @@ pub struct Tracking {
 
 impl TrackStage {
     pub(super) fn new(params: &TrackParams, is_live: bool) -> Self {
+        Self::of(params.enabled.then(|| Tracker::new(params)), is_live)
+    }
+
+    /// `None`: tracking is off.
+    pub(super) fn of(tracker: Option<Tracker>, is_live: bool) -> Self {
         Self {
-            tracker: params.enabled.then(|| Tracker::new(params)),
+            tracker,
             is_live,
             said: State::Initialising,
             secs: 0.0,
