@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use crate::ros::CdrError;
 
 pub mod assemble;
+pub mod face;
 pub mod type_hash;
 pub mod wire;
 #[cfg(feature = "zenoh")]
