@@ -11,8 +11,8 @@ use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
 use crate::node::localise;
-use crate::node::pipeline::{self, Subscriber};
-use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
+use crate::node::pipeline;
+use crate::node::{Job, Outcome, Progress, Stop, linger, outbox, run_dir};
 use crate::source;
 
 pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
@@ -119,16 +119,17 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let source = source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
-    let subscriber: Option<Box<dyn Subscriber>> = subscriber(&params.publish)?;
+    let outbox = outbox(&params)?;
     let is_live = params.source.rate > 0.0;
     let job = Job {
         source,
         params: params.clone(),
         is_live,
         stop: stop.clone(),
+        outbox,
     };
     let bar = bar(is_terminal);
-    let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
+    let outcome = pipeline::run(job, &mut |progress| show(&bar, progress));
     bar.finish_and_clear();
     let mut outcome = outcome?;
     let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;
