@@ -2,6 +2,9 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::Duration;
+
+use crate::clock::Stopwatch;
 
 /// What `send` does when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -149,6 +152,30 @@ impl<T> Receiver<T> {
             Ok(None)
         } else {
             Err(Ended)
+        }
+    }
+
+    /// Waits for an item, but not for ever: `Ok(None)` when none came in time.
+    pub fn recv_within(&self, patience: Duration) -> Result<Option<T>, Ended> {
+        let watch = Stopwatch::start();
+        let mut state = self.shared.lock();
+        loop {
+            if let Some(item) = state.items.pop_front() {
+                drop(state);
+                self.shared.changed.notify_all();
+                return Ok(Some(item));
+            }
+            if !state.sender_is_alive {
+                return Err(Ended);
+            }
+            let Some(rest) = patience.checked_sub(watch.elapsed()) else {
+                return Ok(None);
+            };
+            (state, _) = self
+                .shared
+                .changed
+                .wait_timeout(state, rest)
+                .unwrap_or_else(std::sync::PoisonError::into_inner);
         }
     }
 

@@ -4,6 +4,7 @@
 
 pub mod localise;
 pub mod pipeline;
+pub mod ros2;
 pub mod run_dir;
 mod stages;
 pub mod track_stage;

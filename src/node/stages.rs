@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -13,12 +14,14 @@ use crate::map::snapshot::Snapshot;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
 use crate::select::{Batcher, Selector};
-use crate::source::{Source, SourceCounts};
+use crate::source::{Polled, Source, SourceCounts};
 
 /// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
+/// A source that waits for the world is asked so often whether to go on.
+const PATIENCE: Duration = Duration::from_millis(100);
 /// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
 const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 
@@ -72,13 +75,19 @@ impl SourceStage {
     }
 
     pub(super) fn next(&mut self) -> Option<Frame> {
-        if self.stop.is_asked() {
-            return None;
+        while !self.stop.is_asked() {
+            let watch = Stopwatch::start();
+            let polled = self.source.poll(PATIENCE);
+            if !matches!(polled, Polled::Waiting) {
+                self.decode_secs += watch.secs();
+            }
+            match polled {
+                Polled::Frame(frame) => return Some(frame),
+                Polled::Ended => return None,
+                Polled::Waiting => {}
+            }
         }
-        let watch = Stopwatch::start();
-        let frame = self.source.next();
-        self.decode_secs += watch.secs();
-        frame
+        None
     }
 
     pub(super) fn counts(&self) -> SourceCounts {

@@ -8,6 +8,9 @@ use std::path::PathBuf;
 use crate::ros::CdrError;
 
 pub mod assemble;
+pub mod face;
+#[cfg(feature = "ros2")]
+pub mod ros2;
 pub mod type_hash;
 pub mod wire;
 #[cfg(feature = "zenoh")]
@@ -33,6 +36,9 @@ pub enum PublishError {
     Declare { key: String, reason: String },
     #[error("cannot send {key:?} over zenoh: {reason}")]
     Send { key: String, reason: String },
+    #[cfg(feature = "ros2")]
+    #[error("cannot send {topic:?} over ROS 2: {reason}")]
+    Ros2 { topic: &'static str, reason: String },
     #[error(transparent)]
     Encode(#[from] CdrError),
     #[error(
