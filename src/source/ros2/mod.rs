@@ -8,6 +8,8 @@ mod beside;
 pub mod link;
 pub mod names;
 #[cfg(feature = "ros2")]
+mod pictures;
+#[cfg(feature = "ros2")]
 pub mod subscriber;
 #[cfg(feature = "ros2")]
 mod watch;

@@ -1,51 +1,28 @@
 //! A ROS 2 topic with pictures -> frames, with calibration, odometry and depth from the topics beside it.
 //!
-//! The node's thread puts CDR payloads into a bounded queue, of which the oldest go first; they are decoded here, on the
-//! source's thread, by the same code as recordings.
+//! What `pictures` brings is decoded here, on the source's thread, by the same code as recordings.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use r2r::QosProfile;
-
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::SourceParams;
-use crate::config::ros2::{ImageTransport, OnTimeJump, Reliability};
+use crate::config::ros2::OnTimeJump;
 use crate::frame::Frame;
-use crate::queue::{Receiver, WhenFull, queue};
-use crate::ros::{CompressedImage, Image, Message as _};
 use crate::source::intake::{Extras, Intake};
 use crate::source::mcap::{depth_of, picture_of};
 use crate::source::ros2::beside::{Beside, Companions};
-use crate::source::ros2::link::{Link, LinkError};
-use crate::source::ros2::watch::{Watch, picture_topics, reason};
-use crate::source::survey::{header_frame, header_stamp};
+use crate::source::ros2::link::Link;
+use crate::source::ros2::pictures::{Picture, Subscription};
+use crate::source::ros2::watch::{Watch, why_silent};
+use crate::source::survey::header_frame;
 use crate::source::topics::info_beside;
 use crate::source::{Polled, Source, SourceCounts, SourceError};
 
-/// Pictures between the node's thread and this one: a burst passes, and none is old when it is decoded.
-const MAX_PICTURES: usize = 4;
 /// Stamps that lie so far back are not a matter of order but of another time.
 const JUMP_SECS: f64 = 1.0;
 /// How often what a picture waits for is looked at.
 const TICK: Duration = Duration::from_millis(2);
-
-/// A picture as it came.
-#[derive(Debug)]
-struct Picture {
-    /// `None` where not even the header can be read.
-    stamp: Option<Stamp>,
-    payload: Vec<u8>,
-    age: Stopwatch,
-}
-
-/// The subscription, once it is known as what type.
-#[derive(Debug)]
-struct Subscription {
-    topic: String,
-    is_compressed: bool,
-    pictures: Receiver<Picture>,
-}
 
 #[derive(Debug)]
 pub struct Ros2Source {
@@ -106,74 +83,27 @@ impl Ros2Source {
             watch: Watch::new(),
             is_ended: false,
         };
-        source.subscribe().map_err(|e| fail(e.to_string()))?;
+        source.subscription =
+            Subscription::of(&source.link, topic).map_err(|e| fail(e.to_string()))?;
         Ok(source)
-    }
-
-    /// Subscribes as what the parameters say, else as what is there; while nothing is there, waits for it.
-    fn subscribe(&mut self) -> Result<(), LinkError> {
-        let beside = format!("{}/compressed", self.topic.trim_end_matches('/'));
-        let is_named = self.topic.ends_with("/compressed");
-        let (topic, is_compressed) = match self.link.live.choice("ros2.image_transport") {
-            ImageTransport::Raw => (self.topic.clone(), false),
-            ImageTransport::Compressed if is_named => (self.topic.clone(), true),
-            ImageTransport::Compressed => (beside, true),
-            ImageTransport::Auto => {
-                let type_on = |topic: &str| -> Result<Option<String>, LinkError> {
-                    Ok(self
-                        .link
-                        .publishers(topic)?
-                        .first()
-                        .map(|p| p.type_name.clone()))
-                };
-                match type_on(&self.topic)? {
-                    Some(name) => (self.topic.clone(), name == CompressedImage::TYPE_NAME),
-                    None if is_named => (self.topic.clone(), true),
-                    None if type_on(&beside)?.is_some() => (beside, true),
-                    None => return Ok(()),
-                }
-            }
-        };
-        let (sender, pictures) = queue("ros2 pictures", MAX_PICTURES, WhenFull::DropOldest);
-        let qos = match self.link.live.choice("ros2.reliability") {
-            Reliability::BestEffort => QosProfile::sensor_data().keep_last(10),
-            Reliability::Reliable => QosProfile::default().keep_last(10),
-        };
-        let type_name = type_name(is_compressed);
-        self.link
-            .subscribe(&topic, type_name, qos, move |payload| {
-                let picture = Picture {
-                    stamp: header_stamp(&payload, 0),
-                    payload,
-                    age: Stopwatch::start(),
-                };
-                sender.send(picture).is_ok()
-            })?;
-        tracing::info!("{topic} is subscribed as {type_name}");
-        self.subscription = Some(Subscription {
-            topic,
-            is_compressed,
-            pictures,
-        });
-        Ok(())
     }
 
     /// The oldest picture that came, if one comes in time.
     fn next_picture(&mut self, patience: Duration) -> Option<Picture> {
         if self.subscription.is_none() {
-            if self.watch.is_due()
-                && let Err(e) = self.subscribe()
-            {
-                tracing::warn!("{e}");
-            }
-            if self.subscription.is_none() {
-                self.look_for_silence();
-                std::thread::sleep(patience);
-                return None;
+            match Subscription::of(&self.link, &self.topic) {
+                Ok(subscription) => self.subscription = subscription,
+                Err(e) => tracing::warn!("{e}"),
             }
         }
-        let pictures = &self.subscription.as_ref()?.pictures;
-        match pictures.recv_within(patience) {
+        let Some(subscription) = &self.subscription else {
+            if self.watch.is_due() {
+                self.look_for_silence();
+            }
+            std::thread::sleep(patience);
+            return None;
+        };
+        match subscription.pictures.recv_within(patience) {
             Ok(Some(picture)) => {
                 self.watch.picture_came();
                 Some(picture)
@@ -331,28 +261,19 @@ impl Ros2Source {
 
     /// Says what is missing, and to the status every time.
     fn look_for_silence(&mut self) {
-        let silent_secs = self.watch.silent_secs();
-        let is_silent = silent_secs > self.link.live.number("ros2.silence_secs");
-        let mut warnings = Vec::new();
-        if is_silent {
+        let is_silent = self.watch.silent_secs() > self.link.live.number("ros2.silence_secs");
+        let silence = is_silent.then(|| {
             let (topic, is_compressed) = self
                 .subscription
                 .as_ref()
                 .map_or((self.topic.as_str(), false), |s| {
                     (&s.topic, s.is_compressed)
                 });
-            let peers = self.link.publishers(topic).unwrap_or_default();
-            let others = if peers.is_empty() {
-                picture_topics(&self.link)
-            } else {
-                Vec::new()
-            };
-            let wanted = self.link.live.choice("ros2.reliability");
-            let why = reason(topic, type_name(is_compressed), wanted, &peers, &others);
-            warnings.push(format!("no picture for {} s: {why}", silent_secs.floor()));
-        }
+            why_silent(&self.link, topic, is_compressed)
+        });
+        let mut warnings = Vec::new();
         self.warn_of_companions(&mut warnings);
-        self.watch.report(&self.link, is_silent, warnings);
+        self.watch.report(&self.link, silence, warnings);
     }
 
     fn warn_of_companions(&self, warnings: &mut Vec<String>) {
@@ -437,13 +358,5 @@ impl Source for Ros2Source {
 
     fn truth_extent(&self) -> Option<f64> {
         None
-    }
-}
-
-fn type_name(is_compressed: bool) -> &'static str {
-    if is_compressed {
-        CompressedImage::TYPE_NAME
-    } else {
-        Image::TYPE_NAME
     }
 }

@@ -7,28 +7,56 @@ use crate::clock::Stopwatch;
 use crate::config::ros2::Reliability;
 use crate::ros::{CompressedImage, Image, Message as _};
 use crate::source::ros2::link::{Link, Peer};
+use crate::source::ros2::pictures::type_name;
 
 /// The graph is asked so often while something is missing.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Topics that an error message lists.
 const MAX_LISTED: usize = 8;
+/// Topics of which the publishers are asked.
+const MAX_LOOKED_AT: usize = 32;
+/// Warnings that are remembered as said.
+const MAX_SAID: usize = 64;
 /// What mends lost pictures of publishers that do send.
 const LARGE_PICTURES: &str = "large pictures get lost where FASTRTPS_DEFAULT_PROFILES_FILE does not name launch/fastdds.xml on both sides (docs/ROS2.md)";
 
-/// Topics with pictures, by name: what there is to subscribe to.
-pub(super) fn picture_topics(link: &Link) -> Vec<String> {
+/// Topics on which somebody publishes pictures, by name: what there is to subscribe to.
+fn picture_topics(link: &Link) -> Vec<String> {
     let topics = link.topics().unwrap_or_default();
     let is_picture = |types: &[String]| {
         types
             .iter()
             .any(|name| name == Image::TYPE_NAME || name == CompressedImage::TYPE_NAME)
     };
+    let own = link.names.full_name();
+    // The graph lists topics that are only listened to, by this node, too.
+    let has_publisher = |topic: &String| {
+        let peers = link.publishers(topic).unwrap_or_default();
+        peers.iter().any(|peer| peer.node != own)
+    };
     let pictures = topics.into_iter().filter(|(_, types)| is_picture(types));
-    pictures.map(|(topic, _)| topic).collect()
+    pictures
+        .map(|(topic, _)| topic)
+        .take(MAX_LOOKED_AT)
+        .filter(has_publisher)
+        .take(MAX_LISTED)
+        .collect()
+}
+
+/// Why nothing comes from a topic, as the graph has it.
+pub(super) fn why_silent(link: &Link, topic: &str, is_compressed: bool) -> String {
+    let peers = link.publishers(topic).unwrap_or_default();
+    let others = if peers.is_empty() {
+        picture_topics(link)
+    } else {
+        Vec::new()
+    };
+    let wanted = link.live.choice("ros2.reliability");
+    reason(topic, type_name(is_compressed), wanted, &peers, &others)
 }
 
 /// Why nothing comes from publishers of a topic that is subscribed as `type_name`.
-pub(super) fn reason(
+fn reason(
     topic: &str,
     type_name: &str,
     wanted: Reliability,
@@ -108,13 +136,20 @@ impl Watch {
     }
 
     /// Logs what was not said before of this silence, and hands all of it to the status.
-    pub(super) fn report(&mut self, link: &Link, is_silent: bool, warnings: Vec<String>) {
-        self.is_silent |= is_silent;
-        for warning in &warnings {
-            if self.said.len() < 64 && self.said.insert(warning.clone()) {
+    pub(super) fn report(
+        &mut self,
+        link: &Link,
+        silence: Option<String>,
+        mut warnings: Vec<String>,
+    ) {
+        self.is_silent |= silence.is_some();
+        for warning in silence.iter().chain(&warnings) {
+            if self.said.len() < MAX_SAID && self.said.insert(warning.clone()) {
                 tracing::warn!("{warning}");
             }
         }
+        let secs = self.since_picture.secs().floor();
+        warnings.extend(silence.map(|why| format!("no picture for {secs} s: {why}")));
         link.warn(warnings);
     }
 }
