@@ -11,7 +11,7 @@ mod joined {
 
     use crate::config::Settings;
     use crate::config::ros2::Ros2Face;
-    use crate::source::ros2::link::Link;
+    use crate::source::ros2::link::{Link, NODE_NAME};
     use crate::source::ros2::names::split_arguments;
 
     /// The node, where the parameters, the source or arguments behind `--ros-args` ask for one. Parameters that came by
@@ -25,7 +25,7 @@ mod joined {
             }
         };
         Ok(if is_wanted {
-            Some(Link::open(settings)?)
+            Some(Link::open(settings, NODE_NAME)?)
         } else {
             None
         })

@@ -40,7 +40,6 @@ class Mapper:
         )
 
     def log(self):
-        self.log_file.flush()
         return self.log_path.read_text(errors="replace")
 
     def wait_for_log(self, text, secs=20.0):

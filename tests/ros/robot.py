@@ -1,33 +1,33 @@
 """A robot made of recordings/demo.mcap: camera, calibration, depth, odometry over tf, true poses and /clock.
 
-Knows nothing of the node under test.
+Knows nothing of the node under test. Messages stay bytes wherever they can: rclpy takes large ones apart slowly.
 """
 
 import io
+import struct
 import threading
 import time
 
 import numpy
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from mcap.reader import make_reader
 from PIL import Image as Picture
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
 CAMERA_FRAME = "camera_optical"
-# As publishers of drivers often are, and best effort: what a subscriber must cope with.
-SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST)
+# As many drivers publish.
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def stamp_of(nanos):
     """Nanoseconds as a message."""
-    from builtin_interfaces.msg import Time
-
     return Time(sec=nanos // 10**9, nanosec=nanos % 10**9)
 
 
@@ -37,58 +37,84 @@ def nanos_of(stamp):
 
 
 def load(path):
-    """Payloads by topic, in order: (nanoseconds of the log, CDR bytes)."""
+    """Payloads by topic, in order: CDR bytes."""
     messages = {}
     with open(path, "rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
-            messages.setdefault(channel.topic, []).append((message.log_time, message.data))
+            messages.setdefault(channel.topic, []).append(bytes(message.data))
     return messages
 
 
-def raw_picture(compressed):
-    """A CompressedImage as Image rgb8."""
-    pixels = numpy.asarray(Picture.open(io.BytesIO(bytes(compressed.data))).convert("RGB"))
-    image = Image(header=compressed.header, height=pixels.shape[0], width=pixels.shape[1])
-    image.encoding = "rgb8"
-    image.step = 3 * image.width
-    image.data.frombytes(pixels.tobytes())
-    return image
+def header_nanos(payload):
+    """The stamp of a message that begins with a header."""
+    sec, nanosec = struct.unpack_from("<iI", payload, 4)
+    return sec * 10**9 + nanosec
+
+
+def stamped(payload, nanos):
+    """The same message at another time."""
+    return payload[:4] + struct.pack("<iI", nanos // 10**9, nanos % 10**9) + payload[12:]
+
+
+def text(payload, word):
+    """Appends a string, aligned as CDR wants it."""
+    align(payload, 4)
+    payload += struct.pack("<I", len(word) + 1) + word.encode() + b"\0"
+
+
+def align(payload, to):
+    payload += b"\0" * (-(len(payload) - 4) % to)
+
+
+def image_payload(nanos, frame_id, pixels):
+    """sensor_msgs/msg/Image, rgb8, as CDR; pixels are height by width by 3."""
+    height, width, _ = pixels.shape
+    payload = bytearray(b"\0\1\0\0" + struct.pack("<iI", nanos // 10**9, nanos % 10**9))
+    text(payload, frame_id)
+    align(payload, 4)
+    payload += struct.pack("<II", height, width)
+    text(payload, "rgb8")
+    payload += b"\0"
+    align(payload, 4)
+    payload += struct.pack("<II", 3 * width, pixels.size) + pixels.tobytes()
+    return bytes(payload)
+
+
+def jpeg_of(payload):
+    """The picture inside a CompressedImage."""
+    return payload[payload.index(b"\xff\xd8") :]
+
+
+def raw_payload(compressed, nanos):
+    """A CompressedImage as Image, rgb8."""
+    picture = Picture.open(io.BytesIO(jpeg_of(compressed))).convert("RGB")
+    return image_payload(nanos, CAMERA_FRAME, numpy.asarray(picture))
 
 
 class Robot:
     """Publishes the recording on a thread of its own, at `rate` times its speed."""
 
-    def __init__(self, node, recording, namespace="", picture_type=Image, with_odometry=True):
-        self.node = node
+    def __init__(self, node, recording, picture_type=Image, with_odometry=True):
         self.is_stopping = threading.Event()
         self.with_odometry = with_odometry
         self.n_sent = 0
-        self.pictures = []
-        for nanos, data in recording["/camera/image_raw/compressed"]:
-            message = deserialize_message(data, CompressedImage)
-            # Images as bytes: rclpy would take them apart with each publishing.
-            self.pictures.append((nanos_of(message.header.stamp), message))
+        self.newest_nanos = 0
         self.picture_type = picture_type
-        self.info = deserialize_message(recording["/camera/camera_info"][0][1], CameraInfo)
-        self.depths = self.by_stamp(recording["/camera/depth"], Image)
-        self.poses = self.by_stamp(recording["/ground_truth/pose"], PoseStamped)
-        topic = f"{namespace}/camera/image_raw"
-        if picture_type is CompressedImage:
-            topic += "/compressed"
+        self.pictures = [(header_nanos(p), p) for p in recording["/camera/image_raw/compressed"]]
+        self.info = recording["/camera/camera_info"][0]
+        self.depths = {header_nanos(p): p for p in recording["/camera/depth"]}
+        self.poses = {header_nanos(p): p for p in recording["/ground_truth/pose"]}
         publisher = node.create_publisher
-        self.to_picture = publisher(picture_type, topic, SENSOR)
-        self.to_info = publisher(CameraInfo, f"{namespace}/camera/camera_info", RELIABLE)
-        self.to_depth = publisher(Image, f"{namespace}/camera/depth", SENSOR)
+        suffix = "/compressed" if picture_type is CompressedImage else ""
+        self.to_picture = publisher(picture_type, f"/camera/image_raw{suffix}", SENSOR)
+        self.to_info = publisher(CameraInfo, "/camera/camera_info", RELIABLE)
+        self.to_depth = publisher(Image, "/camera/depth", SENSOR)
         self.to_pose = publisher(PoseStamped, "/ground_truth/pose", RELIABLE)
         self.to_tf = publisher(TFMessage, "/tf", QoSProfile(depth=100))
         self.to_tf_static = publisher(TFMessage, "/tf_static", LATCHED)
         self.to_clock = publisher(Clock, "/clock", SENSOR)
+        self.to_tf_static.publish(TFMessage(transforms=[mount()]))
         self.thread = None
-
-    @staticmethod
-    def by_stamp(messages, kind):
-        decoded = [deserialize_message(data, kind) for _, data in messages]
-        return {nanos_of(message.header.stamp): message for message in decoded}
 
     def start(self, rate=1.0, from_ix=0, to_ix=None, offset_nanos=0):
         """`offset_nanos` is added to every stamp: later passes of the recording are later times."""
@@ -106,52 +132,51 @@ class Robot:
             self.thread.join()
 
     def run(self, rate, pictures, offset_nanos):
-        self.to_tf_static.publish(TFMessage(transforms=[mount(pictures[0][0] + offset_nanos)]))
         begin, first = time.monotonic(), pictures[0][0]
-        for nanos, message in pictures:
+        for nanos, payload in pictures:
             ahead = (nanos - first) / 1e9 / rate - (time.monotonic() - begin)
             if self.is_stopping.wait(max(ahead, 0.0)):
                 return
-            self.send(nanos, message, offset_nanos)
+            self.send(nanos, payload, nanos + offset_nanos)
 
-    def send(self, nanos, message, offset_nanos):
-        stamp = stamp_of(nanos + offset_nanos)
-        self.to_clock.publish(Clock(clock=stamp))
-        pose, depth = self.poses[nanos], self.depths[nanos]
-        for other in (message, pose, depth, self.info):
-            other.header.stamp = stamp
+    def send(self, nanos, payload, at):
+        """The picture that was taken at `nanos`, and all beside it, as if it had been taken at `at`."""
+        self.to_clock.publish(Clock(clock=stamp_of(at)))
+        pose = stamped(self.poses[nanos], at)
         if self.with_odometry:
             self.to_tf.publish(TFMessage(transforms=[odometry(pose)]))
-        self.to_info.publish(self.info)
+        self.to_info.publish(stamped(self.info, at))
         self.to_pose.publish(pose)
-        self.to_depth.publish(depth)
-        self.to_picture.publish(message if self.picture_type is CompressedImage else raw_picture(message))
+        self.to_depth.publish(stamped(self.depths[nanos], at))
+        is_compressed = self.picture_type is CompressedImage
+        self.to_picture.publish(stamped(payload, at) if is_compressed else raw_payload(payload, at))
         self.n_sent += 1
+        self.newest_nanos = at
 
 
-def mount(nanos):
-    """base_link to camera_optical: the camera looks ahead from the robot's origin, half a metre above it."""
+def mount():
+    """base_link to camera_optical: the camera looks ahead, half a metre above the robot's origin."""
     transform = TransformStamped(child_frame_id=CAMERA_FRAME)
     transform.header.frame_id = "base_link"
-    transform.header.stamp = stamp_of(nanos)
     transform.transform.translation.z = 0.5
     rotation = transform.transform.rotation
     rotation.x, rotation.y, rotation.z, rotation.w = -0.5, 0.5, -0.5, 0.5
     return transform
 
 
-def odometry(pose):
+def odometry(pose_payload):
     """odom to base_link, by the true pose of the camera in the recording's world."""
+    pose = deserialize_message(pose_payload, PoseStamped)
     transform = TransformStamped(child_frame_id="base_link")
     transform.header.frame_id = "odom"
     transform.header.stamp = pose.header.stamp
-    camera = matrix(pose.pose.position, pose.pose.orientation)
-    mounted = mount(0).transform
-    base = camera @ numpy.linalg.inv(matrix(mounted.translation, mounted.rotation))
-    transform.transform.translation.x, transform.transform.translation.y, transform.transform.translation.z = base[:3, 3]
-    x, y, z, w = quaternion(base[:3, :3])
-    rotation = transform.transform.rotation
-    rotation.x, rotation.y, rotation.z, rotation.w = x, y, z, w
+    mounted = mount().transform
+    base = matrix(pose.pose.position, pose.pose.orientation) @ numpy.linalg.inv(
+        matrix(mounted.translation, mounted.rotation)
+    )
+    translation, rotation = transform.transform.translation, transform.transform.rotation
+    translation.x, translation.y, translation.z = base[:3, 3]
+    rotation.x, rotation.y, rotation.z, rotation.w = quaternion(base[:3, :3])
     return transform
 
 
@@ -168,9 +193,8 @@ def matrix(translation, rotation):
     return out
 
 
-def quaternion(rotation):
-    """A rotation matrix as x y z w: the eigenvector of Bar-Itzhack's matrix, which has no special cases."""
-    m = rotation
+def quaternion(m):
+    """A rotation matrix as x y z w: the eigenvector of Bar-Itzhack's matrix (2000), which has no special cases."""
     k = numpy.array(
         [
             [m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] - m[1, 2]],
@@ -179,4 +203,4 @@ def quaternion(rotation):
             [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
         ]
     )
-    return numpy.linalg.eigh(k)[1][:, -1]
+    return [float(v) for v in numpy.linalg.eigh(k)[1][:, -1]]

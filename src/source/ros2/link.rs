@@ -20,12 +20,13 @@ use crate::config::{ConfigError, Settings};
 use crate::source::ros2::names::{Names, split_arguments};
 use crate::source::survey::header_stamp;
 
-/// The node's name where no argument gives another.
+/// The mapper's name where no argument gives another.
 pub const NODE_NAME: &str = "splat_mapper";
 /// Longest sleep of the thread; orders wait no longer.
 const SPIN: Duration = Duration::from_millis(5);
 /// Shortest turn of the thread.
 const MIN_SPIN: Duration = Duration::from_micros(100);
+const NEVER: Duration = Duration::from_secs(1 << 30);
 /// Orders on their way to the thread.
 const MAX_ORDERS: usize = 64;
 /// An order that took longer found the thread stuck in the middleware.
@@ -54,6 +55,8 @@ pub struct Spun {
     pub node: r2r::Node,
     /// Each empties one stream; false once nobody wants more of it.
     inlets: Vec<Box<dyn FnMut() -> bool>>,
+    /// Never rings: without anything to wait for, rcl complains and r2r spins (its issue 93).
+    _timer: r2r::Timer,
 }
 
 impl std::fmt::Debug for Spun {
@@ -113,15 +116,16 @@ impl std::fmt::Debug for Link {
 static CURRENT: Mutex<Weak<Link>> = Mutex::new(Weak::new());
 
 impl Link {
-    /// Starts the node. Parameters from ROS 2 (`-p`, `--params-file`) go over those in `settings`.
-    pub fn open(settings: &mut Settings) -> Result<Arc<Self>, LinkError> {
+    /// Starts the node, as `name` where no argument gives another. Parameters from ROS 2 (`-p`, `--params-file`) go over
+    /// those in `settings`.
+    pub fn open(settings: &mut Settings, name: &'static str) -> Result<Arc<Self>, LinkError> {
         let (orders, ordered) = sync_channel(MAX_ORDERS);
         let (started_tx, started) = sync_channel(1);
         let is_ending = Arc::new(AtomicBool::new(false));
         let end = Arc::clone(&is_ending);
         let thread = std::thread::Builder::new()
             .name("ros2".to_owned())
-            .spawn(move || spin(&ordered, &started_tx, &end))
+            .spawn(move || spin(name, &ordered, &started_tx, &end))
             .map_err(|e| start_error(&e))?;
         let started = started.recv_timeout(MAX_ORDER);
         let (namespace, node, overrides) = started.map_err(|e| start_error(&e))??;
@@ -309,11 +313,12 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 type Started = (String, String, Vec<(String, Value)>);
 
 fn spin(
+    name: &str,
     orders: &Receiver<Order>,
     started: &SyncSender<Result<Started, LinkError>>,
     is_ending: &AtomicBool,
 ) {
-    let mut spun = match start() {
+    let mut spun = match start(name) {
         Ok((spun, names)) => {
             started.try_send(Ok(names)).ok();
             spun
@@ -334,21 +339,22 @@ fn spin(
         let watch = Stopwatch::start();
         spun.node.spin_once(SPIN);
         spun.inlets.retain_mut(|inlet| inlet());
-        // Without anything to wait for spin_once returns at once, and so it does after an error (r2r issue 93).
+        // After an error spin_once returns at once.
         if watch.elapsed() < MIN_SPIN {
             std::thread::sleep(MIN_SPIN);
         }
     }
 }
 
-fn start() -> Result<(Spun, Started), LinkError> {
+fn start(name: &str) -> Result<(Spun, Started), LinkError> {
     // r2r panics where rcl refuses an argument.
     let context = std::panic::catch_unwind(r2r::Context::create);
     let context = context.map_err(|panic| LinkError::Start {
         reason: panic.downcast_ref::<String>().cloned().unwrap_or_default(),
     })?;
     let context = context.map_err(|e| start_error(&e))?;
-    let node = r2r::Node::create(context, NODE_NAME, "").map_err(|e| start_error(&e))?;
+    let mut node = r2r::Node::create(context, name, "").map_err(|e| start_error(&e))?;
+    let timer = node.create_wall_timer(NEVER).map_err(|e| start_error(&e))?;
     let namespace = node.namespace().map_err(|e| start_error(&e))?;
     let name = node.name().map_err(|e| start_error(&e))?;
     let overrides = {
@@ -361,6 +367,7 @@ fn start() -> Result<(Spun, Started), LinkError> {
     let spun = Spun {
         node,
         inlets: Vec::new(),
+        _timer: timer,
     };
     Ok((spun, (namespace, name, overrides)))
 }

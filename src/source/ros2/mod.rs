@@ -12,4 +12,4 @@ mod pictures;
 #[cfg(feature = "ros2")]
 pub mod subscriber;
 #[cfg(feature = "ros2")]
-mod watch;
+pub mod watch;

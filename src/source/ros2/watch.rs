@@ -4,13 +4,17 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use crate::clock::Stopwatch;
+use crate::config::Settings;
 use crate::config::ros2::Reliability;
 use crate::ros::{CompressedImage, Image, Message as _};
-use crate::source::ros2::link::{Link, Peer};
+use crate::source::ros2::link::{Link, LinkError, Peer};
 use crate::source::ros2::pictures::type_name;
+use crate::source::topics::info_beside;
 
 /// The graph is asked so often while something is missing.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// With the defaults of Fast DDS a first announcement that is missed costs 3 s.
+const DISCOVERY: Duration = Duration::from_secs(4);
 /// Topics that an error message lists.
 const MAX_LISTED: usize = 8;
 /// Topics of which the publishers are asked.
@@ -41,6 +45,39 @@ fn picture_topics(link: &Link) -> Vec<String> {
         .filter(has_publisher)
         .take(MAX_LISTED)
         .collect()
+}
+
+/// What a look around finds: each topic with pictures, who publishes it and how, and whether a CameraInfo is beside it.
+/// For those who ask before anything runs; takes as long as discovery may.
+pub fn look_around() -> Result<Vec<String>, LinkError> {
+    let link = Link::open(&mut Settings::shipped(), "splat_mapper_doctor")?;
+    let watch = Stopwatch::start();
+    while picture_topics(&link).is_empty() && watch.elapsed() < DISCOVERY {
+        std::thread::sleep(DISCOVERY / 20);
+    }
+    let describe = |topic: String| {
+        let peers = link.publishers(&topic).unwrap_or_default();
+        let Some(peer) = peers.first() else {
+            return topic;
+        };
+        let reliability = if peer.is_reliable {
+            "reliable"
+        } else {
+            "best effort"
+        };
+        let info = info_beside(&topic);
+        let has_info = link.publishers(&info).is_ok_and(|peers| !peers.is_empty());
+        let calibration = if has_info {
+            "with CameraInfo".to_owned()
+        } else {
+            format!("no CameraInfo on {info}")
+        };
+        format!(
+            "{topic} ({}, {reliability}, by {}, {calibration})",
+            peer.type_name, peer.node
+        )
+    };
+    Ok(picture_topics(&link).into_iter().map(describe).collect())
 }
 
 /// Why nothing comes from a topic, as the graph has it.
