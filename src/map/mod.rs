@@ -9,6 +9,7 @@ mod depth_scale;
 mod gauge;
 mod growth;
 mod held_out;
+mod ids;
 pub mod keyframes;
 pub mod layout;
 mod matches;
@@ -31,6 +32,7 @@ use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
+use crate::map::ids::SplatIds;
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
 use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
@@ -50,6 +52,7 @@ const LAST_RESEED: f32 = 0.6;
 pub struct SplatMap {
     params: MapParams,
     engine: Box<dyn Engine>,
+    ids: SplatIds,
     schedule: Schedule,
     rng: Pcg64Mcg,
     keyframes: Keyframes,
@@ -93,6 +96,7 @@ impl SplatMap {
         Self {
             params,
             engine,
+            ids: SplatIds::default(),
             schedule: Schedule::new(seed),
             rng: Pcg64Mcg::seed_from_u64(seed ^ 0x5eed_0002),
             keyframes: Keyframes::default(),
@@ -200,6 +204,7 @@ impl SplatMap {
             .collect();
         self.scale = self.measure_scale(&poses);
         self.revision += 1;
+        let (splats, splat_ids) = self.finite_splats();
         Arc::new(Snapshot {
             map_id: self.map_id(),
             epoch: self.epoch,
@@ -207,7 +212,8 @@ impl SplatMap {
             stamp: poses.last().map(|pose| pose.stamp).unwrap_or_default(),
             scale: self.scale,
             poses,
-            splats: Arc::new(self.engine.splats().into_finite()),
+            splats: Arc::new(splats),
+            splat_ids: Arc::new(splat_ids),
         })
     }
 

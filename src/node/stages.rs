@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
@@ -11,8 +12,10 @@ use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
+use crate::node::outward::Clerk;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
+use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
 use crate::source::{Polled, Source, SourceCounts};
 
@@ -29,6 +32,7 @@ const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 pub(super) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
+    outbox: Option<Arc<Outbox>>,
     pub(super) decode_secs: f64,
 }
 
@@ -56,6 +60,8 @@ pub(super) struct MapStage {
     is_live: bool,
     stop: Stop,
     n_frames: Option<u64>,
+    pub(super) clerk: Clerk,
+    outbox: Option<Arc<Outbox>>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
     since_snapshot: Stopwatch,
@@ -66,14 +72,16 @@ pub(super) struct MapStage {
 }
 
 impl SourceStage {
-    pub(super) fn new(source: Box<dyn Source>, stop: Stop) -> Self {
+    pub(super) fn new(source: Box<dyn Source>, stop: Stop, outbox: Option<Arc<Outbox>>) -> Self {
         Self {
             source,
             stop,
+            outbox,
             decode_secs: 0.0,
         }
     }
 
+    /// While paused, frames come and go.
     pub(super) fn next(&mut self) -> Option<Frame> {
         while !self.stop.is_asked() {
             let watch = Stopwatch::start();
@@ -81,13 +89,42 @@ impl SourceStage {
             if !matches!(polled, Polled::Waiting) {
                 self.decode_secs += watch.secs();
             }
+            let Some(outbox) = self.outbox.as_ref() else {
+                match polled {
+                    Polled::Frame(frame) => return Some(frame),
+                    Polled::Ended => return None,
+                    Polled::Waiting => continue,
+                }
+            };
+            let warnings = self.source.warnings();
+            outbox.note(|standing| standing.source_notes = warnings);
+            if let Polled::Frame(frame) = &polled {
+                if let Some(mount) = self.source.mount() {
+                    outbox.mount(mount);
+                }
+                outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
+            }
+            let switches = outbox.switches();
+            if switches.wants_reset.swap(false, Ordering::Relaxed) {
+                self.stop.ask_restart();
+                return None;
+            }
+            let is_paused = switches.is_paused.load(Ordering::Relaxed);
+            outbox.note(|standing| standing.is_paused = is_paused);
             match polled {
-                Polled::Frame(frame) => return Some(frame),
-                Polled::Ended => return None,
-                Polled::Waiting => {}
+                Polled::Frame(frame) if !is_paused => return Some(frame),
+                Polled::Frame(_) | Polled::Waiting => {}
+                Polled::Ended => {
+                    outbox.note(|standing| standing.has_ended = true);
+                    return None;
+                }
             }
         }
         None
+    }
+
+    pub(super) fn into_source(self) -> Box<dyn Source> {
+        self.source
     }
 
     pub(super) fn counts(&self) -> SourceCounts {
@@ -172,16 +209,19 @@ impl MapStage {
     pub(super) fn new(
         map: SplatMap,
         params: &Params,
-        is_live: bool,
+        (is_live, n_frames): (bool, Option<u64>),
         stop: Stop,
-        n_frames: Option<u64>,
+        outbox: Option<Arc<Outbox>>,
     ) -> Self {
+        let calls = outbox.as_ref().and_then(|outbox| outbox.take_calls());
         Self {
             map,
             params: params.map.clone(),
             is_live,
             stop,
             n_frames,
+            clerk: Clerk::new(calls, &params.track, params.seed),
+            outbox,
             unpublished: BTreeMap::new(),
             since_snapshot: Stopwatch::start(),
             n_keyframes: 0,
@@ -214,10 +254,15 @@ impl MapStage {
         let watch = Stopwatch::start();
         for id in self.map.add(batch, geometry, progress) {
             if let Some(age) = self.unpublished.get(&id) {
-                self.keyframe_to_pose_secs.push(age.secs());
+                let secs = age.secs();
+                self.keyframe_to_pose_secs.push(secs);
+                if let Some(outbox) = &self.outbox {
+                    outbox.note(|standing| standing.keyframe_to_pose.note(secs));
+                }
             }
         }
         self.optimise_secs += watch.secs();
+        self.note();
         if !self.is_live {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
@@ -251,8 +296,34 @@ impl MapStage {
         }
         self.optimise_secs += watch.secs();
         let snapshot = self.snapshot();
-        publish(Arc::clone(&snapshot), self.progress());
+        self.note();
+        let last = Progress {
+            has_ended: true,
+            ..self.progress()
+        };
+        publish(Arc::clone(&snapshot), last);
         snapshot
+    }
+
+    /// Calls from outside, while nothing else is to be done.
+    pub(super) fn serve(&mut self) {
+        self.clerk.serve(&mut self.map);
+    }
+
+    /// Writes the map's part of the status.
+    fn note(&self) {
+        let Some(outbox) = &self.outbox else { return };
+        let (map, optimise_secs) = (&self.map, self.optimise_secs);
+        outbox.note(|standing| {
+            standing.n_placed = map.n_keyframes() as u64;
+            standing.n_components = map.components().len() as u64;
+            standing.n_splats = map.n_splats() as u64;
+            standing.n_steps = map.n_steps();
+            standing.gpu_bytes = map.peak_gpu_bytes();
+            if optimise_secs > 0.0 {
+                standing.steps_per_s = map.n_steps() as f64 / optimise_secs;
+            }
+        });
     }
 
     fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
@@ -278,6 +349,7 @@ impl MapStage {
             if self.map.step(n, phase(self.map.n_steps())) == 0 {
                 break;
             }
+            self.clerk.serve(&mut self.map);
             self.snapshot_if_due(publish);
         }
     }
@@ -290,6 +362,7 @@ impl MapStage {
     }
 
     fn snapshot(&mut self) -> Arc<Snapshot> {
+        self.note();
         let snapshot = self.map.snapshot();
         self.since_snapshot = Stopwatch::start();
         for pose in &snapshot.poses {
@@ -311,6 +384,7 @@ impl MapStage {
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
             steps_planned: if self.is_live { 0 } else { self.params.steps },
+            has_ended: false,
         }
     }
 }

@@ -1,11 +1,13 @@
-//! What all faces to the world have in common: topics with their delivery, services, and bytes on their way.
+//! What all faces to the world have in common: topics with their delivery, and bytes on their way.
 //!
 //! A face (ROS 2, zenoh, a recording) carries CDR bytes and knows nothing of what they mean.
 
 use std::sync::Arc;
 
+use serde::Serialize;
+
 use crate::clock::Stamp;
-use crate::publish::PublishError;
+use crate::publish::{PublishError, wire};
 use crate::ros::Message;
 
 /// How messages of a topic travel, as REP-2003 asks.
@@ -51,11 +53,37 @@ pub struct Post {
     pub payload: Arc<[u8]>,
 }
 
+impl Post {
+    /// A message on a topic, whose type must be the topic's.
+    pub fn of<T: Message + Serialize>(
+        topic: &'static Topic,
+        stamp: Stamp,
+        message: &T,
+    ) -> Result<Self, PublishError> {
+        assert_eq!(
+            topic.type_name,
+            T::TYPE_NAME,
+            "{} carries its own type",
+            topic.name
+        );
+        Ok(Self {
+            topic,
+            stamp,
+            payload: wire::payload(message)?.into(),
+        })
+    }
+}
+
 /// A way out of the node. Called from several threads.
 pub trait Face: Send + Sync {
     /// Returns when the message is handed over; a slow peer may hold up messages of a reliable topic for a while.
     fn send(&self, post: &Post) -> Result<(), PublishError>;
 
-    /// Ends all that the face has begun, within two seconds.
-    fn close(self: Box<Self>);
+    /// Where peers may connect; none for most.
+    fn endpoints(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// Ends all that the face has begun, within two seconds; later messages are left out.
+    fn close(&self) -> Result<(), PublishError>;
 }

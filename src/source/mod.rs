@@ -25,6 +25,7 @@ use std::time::Duration;
 
 use crate::config::SourceParams;
 use crate::frame::Frame;
+use crate::pose::Rigid;
 
 /// What a source met so far; copied into `report.json`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -85,6 +86,11 @@ pub trait Source: Send {
     /// The next frame, if one comes within `patience`. Sources that wait for the world override it.
     fn poll(&mut self, _patience: Duration) -> Polled {
         self.next().map_or(Polled::Ended, Polled::Frame)
+    }
+
+    /// How the camera is mounted on the robot, `base_from_cam` in metres, where the input says so.
+    fn mount(&self) -> Option<Rigid> {
+        None
     }
 
     /// What keeps pictures from coming, a line each.

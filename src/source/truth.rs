@@ -137,7 +137,7 @@ impl Odometry {
             Self::Transforms {
                 transforms,
                 camera_frame,
-            } => transforms.odom_from(camera_frame, stamp),
+            } => transforms.moving(ODOM_FRAME, camera_frame, stamp),
         }
     }
 }
@@ -231,9 +231,9 @@ impl Transforms {
         Some(top_from_child)
     }
 
-    /// `odom_from_cam` at a time.
-    pub(super) fn odom_from(&self, camera_frame: &str, stamp: Stamp) -> Option<Rigid> {
-        let chain = self.chain(camera_frame, ODOM_FRAME)?;
+    /// `parent_from_child` at a time between messages.
+    pub(super) fn moving(&self, parent: &str, child: &str, stamp: Stamp) -> Option<Rigid> {
+        let chain = self.chain(child, parent)?;
         Self::along(&chain, |track| track.between(stamp))
     }
 
@@ -250,6 +250,12 @@ impl Transforms {
         self.links.retain(|_, link| !link.track.is_empty());
         let lengths = self.links.values().map(|link| link.track.by_nanos.len());
         self.n_transforms = lengths.sum();
+    }
+
+    /// Whether a frame is above another.
+    #[cfg(feature = "ros2")]
+    pub(super) fn reaches(&self, child: &str, parent: &str) -> bool {
+        self.chain(child, parent).is_some()
     }
 
     /// Whether odometry's frame is above the camera's.

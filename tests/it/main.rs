@@ -9,6 +9,7 @@ mod alignment;
 mod backends;
 mod bags;
 mod declared_lengths;
+mod deltas;
 mod engine;
 mod eval;
 mod eval_lines;

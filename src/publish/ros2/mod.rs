@@ -83,8 +83,9 @@ impl Face for Ros2Face {
             .map_err(|e| fail(e.to_string()))
     }
 
-    fn close(self: Box<Self>) {
+    fn close(&self) -> Result<(), PublishError> {
         self.link.close();
+        Ok(())
     }
 }
 

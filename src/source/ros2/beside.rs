@@ -45,6 +45,7 @@ struct Heard {
 #[derive(Debug)]
 pub(super) struct Beside {
     heard: Arc<Mutex<Heard>>,
+    odom_frame: String,
     pub(super) has_odometry_topic: bool,
     has_truth_topic: bool,
     has_depth_topic: bool,
@@ -66,6 +67,7 @@ impl Beside {
     ) -> Result<Self, LinkError> {
         let beside = Self {
             heard: Arc::default(),
+            odom_frame: link.live.choice("publish.odom_frame"),
             has_odometry_topic: !params.odometry_topic.is_empty(),
             has_truth_topic: !params.pose_topic.is_empty(),
             has_depth_topic: !params.depth_topic.is_empty(),
@@ -158,7 +160,8 @@ impl Beside {
 
     /// Whether transforms lead from the camera to odometry's frame.
     pub(super) fn reaches_odometry(&self, camera_frame: &str) -> bool {
-        lock(&self.heard).transforms.reaches_odometry(camera_frame)
+        let heard = lock(&self.heard);
+        heard.transforms.reaches(camera_frame, &self.odom_frame)
     }
 
     pub(super) fn has_moving_transforms(&self) -> bool {
@@ -170,6 +173,11 @@ impl Beside {
         let heard = lock(&self.heard);
         let (base, _) = heard.odometry.as_ref()?;
         Some((base.clone(), heard.transforms.fixed(base, camera_frame)))
+    }
+
+    /// A frame that is fixed to another.
+    pub(super) fn fixed(&self, parent: &str, child: &str) -> Option<Rigid> {
+        lock(&self.heard).transforms.fixed(parent, child)
     }
 
     /// What belongs to a picture, and whether all of it is there that may still come.
@@ -186,7 +194,10 @@ impl Beside {
                 .between(stamp)
                 .map(|odom_from_base| odom_from_base * mount.unwrap_or(Rigid::IDENTITY))
         } else if uses_transforms {
-            heard.transforms.odom_from(camera_frame, stamp)
+            {
+                let transforms = &heard.transforms;
+                transforms.moving(&self.odom_frame, camera_frame, stamp)
+            }
         } else {
             None
         };

@@ -17,7 +17,7 @@ use serde_json::Value;
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::live::Live;
 use crate::config::{ConfigError, Settings};
-use crate::source::ros2::names::{Names, split_arguments};
+use crate::source::ros2::names::{Names, ros_arguments};
 use crate::source::survey::header_stamp;
 
 /// The mapper's name where no argument gives another.
@@ -137,13 +137,12 @@ impl Link {
                 settings.set(&key, value)?;
             }
         }
-        let (_, ros_arguments) = split_arguments(std::env::args_os());
         let has_sim_time = settings.value("use_sim_time") == Some(&Value::Bool(true));
         let link = Arc::new(Self {
             orders,
             is_ending,
             thread: Mutex::new(Some(thread)),
-            names: Names::new(&namespace, &node, &ros_arguments),
+            names: Names::new(&namespace, &node, &ros_arguments()),
             live: Arc::new(Live::new(settings.clone())),
             sim_nanos: has_sim_time.then(|| Arc::new(AtomicI64::new(i64::MIN))),
             warnings: Mutex::new(Vec::new()),

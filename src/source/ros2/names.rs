@@ -19,6 +19,11 @@ pub fn split_arguments(arguments: impl Iterator<Item = OsString>) -> (Vec<OsStri
     (own, ros)
 }
 
+/// Those of this process behind `--ros-args`.
+pub fn ros_arguments() -> Vec<String> {
+    split_arguments(std::env::args_os()).1
+}
+
 /// Rules `-r from:=to` for topics, and where the node stands.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Names {

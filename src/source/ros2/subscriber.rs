@@ -9,6 +9,8 @@ use crate::clock::{Stamp, Stopwatch};
 use crate::config::SourceParams;
 use crate::config::ros2::OnTimeJump;
 use crate::frame::Frame;
+use crate::pose::Rigid;
+use crate::queue::Received;
 use crate::source::intake::{Extras, Intake};
 use crate::source::mcap::{depth_of, picture_of};
 use crate::source::ros2::beside::{Beside, Companions};
@@ -103,18 +105,18 @@ impl Ros2Source {
             std::thread::sleep(patience);
             return None;
         };
-        match subscription.pictures.recv_within(patience) {
-            Ok(Some(picture)) => {
+        match subscription.pictures.recv_timeout(patience) {
+            Received::Item(picture) => {
                 self.watch.picture_came();
                 Some(picture)
             }
-            Ok(None) => {
+            Received::Nothing => {
                 if self.watch.is_due() {
                     self.look_for_silence();
                 }
                 None
             }
-            Err(_ended) => {
+            Received::Ended => {
                 self.is_ended = true;
                 None
             }
@@ -335,6 +337,11 @@ impl Source for Ros2Source {
                 return Polled::Frame(frame);
             }
         }
+    }
+
+    fn mount(&self) -> Option<Rigid> {
+        let base_frame: String = self.link.live.choice("publish.base_frame");
+        self.beside.fixed(&base_frame, &self.camera_frame)
     }
 
     fn warnings(&self) -> Vec<String> {
