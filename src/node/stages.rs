@@ -33,6 +33,7 @@ pub(super) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
     outbox: Option<Arc<Outbox>>,
+    is_mounted: bool,
     pub(super) decode_secs: f64,
 }
 
@@ -77,6 +78,7 @@ impl SourceStage {
             source,
             stop,
             outbox,
+            is_mounted: false,
             decode_secs: 0.0,
         }
     }
@@ -99,8 +101,10 @@ impl SourceStage {
             let warnings = self.source.warnings();
             outbox.note(|standing| standing.source_notes = warnings);
             if let Polled::Frame(frame) = &polled {
-                if let Some(mount) = self.source.mount() {
-                    outbox.mount(mount);
+                if !self.is_mounted {
+                    let mount = self.source.mount();
+                    outbox.meet_camera(mount, self.source.camera_frame());
+                    self.is_mounted = mount.is_some();
                 }
                 outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
             }

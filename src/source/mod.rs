@@ -93,6 +93,11 @@ pub trait Source: Send {
         None
     }
 
+    /// Name of the camera's frame, optical axes; empty where the input names none.
+    fn camera_frame(&self) -> &str {
+        ""
+    }
+
     /// What keeps pictures from coming, a line each.
     fn warnings(&self) -> Vec<String> {
         Vec::new()

@@ -344,6 +344,10 @@ impl Source for Ros2Source {
         self.beside.fixed(&base_frame, &self.camera_frame)
     }
 
+    fn camera_frame(&self) -> &str {
+        &self.camera_frame
+    }
+
     fn warnings(&self) -> Vec<String> {
         self.link.warnings()
     }
