@@ -82,12 +82,8 @@ pub struct SplatMap {
 
 impl std::fmt::Debug for SplatMap {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "SplatMap({} keyframes, {} splats)",
-            self.keyframes.placed.len(),
-            self.engine.n_splats()
-        )
+        let (n_keyframes, n_splats) = (self.n_keyframes(), self.n_splats());
+        write!(f, "SplatMap({n_keyframes} keyframes, {n_splats} splats)")
     }
 }
 

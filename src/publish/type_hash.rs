@@ -149,8 +149,8 @@ fn type_json(type_name: &str, body: &str, types: &BTreeMap<String, &str>) -> Str
         let (Some(type_text), Some(name)) = (words.next(), words.next()) else {
             continue;
         };
-        // A constant, not a field.
-        if text.contains('=') {
+        // A constant, not a field with a bound.
+        if text.replace("<=", "").contains('=') {
             continue;
         }
         fields.push(format!(

@@ -40,12 +40,14 @@ fn pieces(update: &Update, held: &Snapshot) -> Vec<SplatDelta> {
 }
 
 fn follow(follower: &mut Follower, pieces: &[SplatDelta]) -> Followed {
-    let steps = pieces.iter().map(|piece| {
+    let mut steps = pieces.iter().map(|piece| {
         let payload = wire::payload(piece).unwrap();
         assert!(payload.len() <= MAX_MESSAGE_BYTES);
         follower.add_payload(&dds_type_name::<SplatDelta>(), &payload)
     });
-    steps.last().unwrap()
+    steps
+        .find(|step| *step != Followed::Nothing)
+        .unwrap_or(Followed::Nothing)
 }
 
 /// The next revision: some splats gone, all others moved a little, a few much, and new ones behind.
