@@ -106,6 +106,10 @@ impl ZenohFace {
                 sequence: AtomicI64::new(0),
                 congestion_control: match topic.delivery {
                     Delivery::Newest => CongestionControl::Drop,
+                    // Transforms and diagnostics come again soon, and poses wait behind them.
+                    Delivery::Reliable { .. } if topic.name.starts_with('/') => {
+                        CongestionControl::Drop
+                    }
                     // A map without one of its pieces is incomplete.
                     Delivery::Latched { .. } | Delivery::Reliable { .. } => {
                         CongestionControl::Block
