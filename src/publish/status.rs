@@ -177,7 +177,7 @@ impl Standing {
             state: self.state(),
             reason: self.reason.clone(),
             frames_received: self.counts.received,
-            frames_dropped: self.n_dropped,
+            frames_dropped: self.n_dropped + self.counts.dropped,
             frames_undecodable: self.counts.undecodable,
             frames_out_of_order: self.counts.out_of_order,
             frames_tracked: self.n_tracked,
