@@ -137,6 +137,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     }
     let missing = |name: &str| damaged(format!("no section {name}"));
     let meta: Meta = meta.ok_or_else(|| missing("META"))?;
+    let splats = splats.ok_or_else(|| missing("SPLT"))?;
     Ok(Checkpoint {
         snapshot: Snapshot {
             map_id: meta.map_id,
@@ -145,7 +146,8 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
             stamp: meta.stamp,
             scale: meta.scale,
             poses: keyframes.ok_or_else(|| missing("KEYF"))?,
-            splats: Arc::new(splats.ok_or_else(|| missing("SPLT"))?),
+            splat_ids: Arc::new((0..splats.len() as u32).collect()),
+            splats: Arc::new(splats),
         },
         seed: meta.seed,
         steps: meta.steps,

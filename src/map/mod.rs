@@ -3,15 +3,14 @@
 //! The only part that knows the map frame. Owns the engine; reads back from it only when a batch comes, at
 //! intervals of many steps, and for snapshots.
 
-mod ab;
 pub mod align;
 pub mod checkpoint;
-mod contradicted;
 pub mod correction;
 mod depth_scale;
 mod gauge;
 mod growth;
 mod held_out;
+mod ids;
 pub mod keyframes;
 pub mod layout;
 mod matches;
@@ -37,6 +36,7 @@ use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::correction::Correction;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
+use crate::map::ids::SplatIds;
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::schedule::{Phase, Schedule};
 use crate::map::settle::Settling;
@@ -57,6 +57,7 @@ const LAST_RESEED: f32 = 0.6;
 pub struct SplatMap {
     params: MapParams,
     engine: Box<dyn Engine>,
+    ids: SplatIds,
     schedule: Schedule,
     rng: Pcg64Mcg,
     keyframes: Keyframes,
@@ -89,12 +90,8 @@ pub struct SplatMap {
 
 impl std::fmt::Debug for SplatMap {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "SplatMap({} keyframes, {} splats)",
-            self.keyframes.placed.len(),
-            self.engine.n_splats()
-        )
+        let (n_keyframes, n_splats) = (self.n_keyframes(), self.n_splats());
+        write!(f, "SplatMap({n_keyframes} keyframes, {n_splats} splats)")
     }
 }
 
@@ -103,6 +100,7 @@ impl SplatMap {
         Self {
             params,
             engine,
+            ids: SplatIds::default(),
             schedule: Schedule::new(seed),
             rng: Pcg64Mcg::seed_from_u64(seed ^ 0x5eed_0002),
             keyframes: Keyframes::default(),
@@ -212,6 +210,7 @@ impl SplatMap {
             .collect();
         self.scale = self.measure_scale(&poses);
         self.revision += 1;
+        let (splats, splat_ids) = self.finite_splats();
         Arc::new(Snapshot {
             map_id: self.map_id(),
             epoch: self.epoch,
@@ -219,7 +218,8 @@ impl SplatMap {
             stamp: poses.last().map(|pose| pose.stamp).unwrap_or_default(),
             scale: self.scale,
             poses,
-            splats: Arc::new(self.engine.splats().into_finite()),
+            splats: Arc::new(splats),
+            splat_ids: Arc::new(splat_ids),
         })
     }
 
@@ -373,9 +373,6 @@ impl SplatMap {
         self.prune();
         if !fresh.is_empty() {
             self.unsettle();
-        }
-        if ab::on("CONTRA") {
-            self.remove_contradicted(&fresh);
         }
         for id in &fresh {
             self.seed_from(*id, false);

@@ -10,6 +10,7 @@ mod backends;
 mod bags;
 mod corrections;
 mod declared_lengths;
+mod deltas;
 mod engine;
 mod eval;
 mod eval_lines;
