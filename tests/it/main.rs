@@ -27,6 +27,7 @@ mod hostile_bags;
 mod hostile_scenes;
 mod hostile_splats;
 mod html;
+mod joint;
 mod known;
 mod layers;
 mod lenses;

@@ -41,8 +41,8 @@ const SMALL_SHIFT: f64 = 0.1;
 const SMALL_TURN: f64 = 0.02;
 const SMALL_SCALE: f64 = 0.06;
 /// Of a way's drift: turn in radians, and logarithm of scale.
-const MAX_TURN: f64 = 0.8;
-const MAX_SCALE: f64 = 0.7;
+const MAX_TURN: f64 = 0.35;
+const MAX_SCALE: f64 = 0.3;
 /// Links that wait for a neighbour's word.
 const MAX_PENDING: usize = 12;
 

@@ -31,8 +31,8 @@ const MIN_LINKS: usize = 2;
 const SAME: [f64; 3] = [0.2, 0.07, 0.15];
 const RIVAL: f64 = 0.6;
 /// Of a way's drift: turn in radians, logarithm of scale.
-const MAX_TURN: f64 = 0.8;
-const MAX_SCALE: f64 = 0.7;
+const MAX_TURN: f64 = 0.35;
+const MAX_SCALE: f64 = 0.3;
 /// Steps of the graph of poses, shots that each is tied to, and standard deviations that links must fit within.
 const MAX_STEPS: usize = 60;
 const N_TIED: usize = 2;
