@@ -44,7 +44,7 @@ pub enum LinkError {
     Refused { what: String, reason: String },
     #[error("ROS 2 did not answer within {} s while asked for {what}", MAX_ORDER.as_secs())]
     Stuck { what: String },
-    #[error("parameter given by ROS 2: {0}")]
+    #[error(transparent)]
     Parameter(#[from] ConfigError),
 }
 
@@ -122,21 +122,25 @@ impl Link {
         let (orders, ordered) = sync_channel(MAX_ORDERS);
         let (started_tx, started) = sync_channel(1);
         let is_ending = Arc::new(AtomicBool::new(false));
-        let end = Arc::clone(&is_ending);
+        let asked = Arc::clone(&is_ending);
         let thread = std::thread::Builder::new()
             .name("ros2".to_owned())
-            .spawn(move || spin(name, &ordered, &started_tx, &end))
+            .spawn(move || spin(name, &ordered, &started_tx, &asked))
             .map_err(|e| start_error(&e))?;
         let started = started.recv_timeout(MAX_ORDER);
-        let (namespace, node, overrides) = started.map_err(|e| start_error(&e))??;
-        for (key, value) in overrides {
-            // rclcpp knows these of its own accord; here QoS is chosen by parameters of the node.
-            if key.starts_with("qos_overrides.") {
-                tracing::warn!("parameter {key} does nothing here");
-            } else {
-                settings.set(&key, value)?;
+        let started = started.unwrap_or_else(|e| Err(start_error(&e)));
+        let applied = started.and_then(|(namespace, node, overrides)| {
+            apply(settings, overrides)?;
+            Ok((namespace, node))
+        });
+        let (namespace, node) = match applied {
+            Ok(names) => names,
+            Err(error) => {
+                // The middleware must not be in use while the process ends.
+                end(thread, &is_ending);
+                return Err(error);
             }
-        }
+        };
         let has_sim_time = settings.value("use_sim_time") == Some(&Value::Bool(true));
         let link = Arc::new(Self {
             orders,
@@ -276,23 +280,9 @@ impl Link {
 
     /// Ends the thread, and with it all subscriptions, publishers and services. Later orders are refused.
     pub fn close(&self) {
-        self.is_ending.store(true, Ordering::Relaxed);
         let thread = lock(&self.thread).take();
-        let Some(thread) = thread else {
-            return;
-        };
-        let watch = Stopwatch::start();
-        while !thread.is_finished() && watch.elapsed() < MAX_CLOSING {
-            std::thread::sleep(SPIN);
-        }
-        if thread.is_finished() {
-            if thread.join().is_err() {
-                tracing::warn!("the thread of the ROS 2 node panicked");
-            }
-        } else {
-            tracing::warn!(
-                "the ROS 2 node did not end within {MAX_CLOSING:?}; its thread is left behind"
-            );
+        if let Some(thread) = thread {
+            end(thread, &self.is_ending);
         }
     }
 }
@@ -301,6 +291,33 @@ impl Drop for Link {
     fn drop(&mut self) {
         self.close();
     }
+}
+
+fn end(thread: JoinHandle<()>, is_ending: &AtomicBool) {
+    is_ending.store(true, Ordering::Relaxed);
+    let watch = Stopwatch::start();
+    while !thread.is_finished() && watch.elapsed() < MAX_CLOSING {
+        std::thread::sleep(SPIN);
+    }
+    if !thread.is_finished() {
+        tracing::warn!(
+            "the ROS 2 node did not end within {MAX_CLOSING:?}; its thread is left behind"
+        );
+    } else if thread.join().is_err() {
+        tracing::warn!("the thread of the ROS 2 node panicked");
+    }
+}
+
+fn apply(settings: &mut Settings, overrides: Vec<(String, Value)>) -> Result<(), ConfigError> {
+    for (key, value) in overrides {
+        // rclcpp knows these of its own accord; here QoS is chosen by parameters of the node.
+        if key.starts_with("qos_overrides.") {
+            tracing::warn!("parameter {key} does nothing here");
+        } else {
+            settings.set(&key, value)?;
+        }
+    }
+    Ok(())
 }
 
 /// What these mutexes hold is exchanged whole: a panic leaves nothing half made.
