@@ -2,13 +2,14 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod autosave;
 pub mod localise;
 pub mod pipeline;
 pub mod run_dir;
 mod stages;
 pub mod track_stage;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -25,7 +26,7 @@ use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
-use crate::map::snapshot::{Scale, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::node::pipeline::Subscriber;
 use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
@@ -44,6 +45,8 @@ pub struct Job {
     /// A live source drops frames rather than wait, and the map is optimised as long as frames come.
     pub is_live: bool,
     pub stop: Stop,
+    /// Run directory: autosaves go there, and what memory has no room for.
+    pub out: Option<PathBuf>,
 }
 
 impl std::fmt::Debug for Job {
@@ -111,6 +114,15 @@ pub struct Outcome {
     pub error: Option<String>,
     /// Given back so that it can stay up for late joiners.
     pub subscriber: Option<Box<dyn Subscriber>>,
+}
+
+impl Outcome {
+    /// Keyframes of this run, without those of a saved map.
+    pub fn own_poses(&self) -> &[KeyframePose] {
+        let poses = &self.snapshot.poses;
+        let first_id = self.map.first_id();
+        &poses[poses.partition_point(|pose| pose.keyframe_id < first_id)..]
+    }
 }
 
 impl std::fmt::Debug for Outcome {

@@ -1,5 +1,6 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::anyhow;
@@ -7,8 +8,9 @@ use anyhow::anyhow;
 use crate::clock::Stopwatch;
 use crate::frame::{Batch, Frame};
 use crate::geometry::{GeometryBatch, GeometryError};
-use crate::map::SplatMap;
 use crate::map::snapshot::Snapshot;
+use crate::map::{SplatMap, checkpoint};
+use crate::node::autosave::Autosave;
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
 use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
 use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
@@ -41,18 +43,34 @@ pub fn run(
     let watch = Stopwatch::start();
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
     let n_frames = job.source.len_hint().filter(|n| *n > 0);
-    let map = SplatMap::new(
+    let mut map = SplatMap::new(
         job.params.map.clone(),
         job.params.seed,
         scale,
         engine(job.params.backend, job.params.deterministic)?,
     )
-    .measuring_scale(&job.params.scale);
+    .measuring_scale(&job.params.scale)
+    .spilling_to(job.out.as_deref());
+    let mut track = TrackStage::new(&job.params.track, job.is_live);
+    if !job.params.map.load.is_empty() {
+        let saved = checkpoint::read(Path::new(&job.params.map.load))?;
+        track.begin_in(&saved.landmarks, &job.params.track)?;
+        map = map
+            .continued(saved, &job.params.track)
+            .map_err(|reason| anyhow!("cannot go on from {}: {reason}", job.params.map.load))?;
+    }
+    let (landmarks_tx, landmarks) = queue("landmarks", 1, WhenFull::DropOldest);
+    let autosave_secs = job.params.map.autosave_secs;
+    let autosave = Autosave::start(job.out.as_deref(), autosave_secs, landmarks)?;
+    if autosave.is_some() {
+        track.tell_landmarks(autosave_secs, landmarks_tx);
+    }
     let stages = Stages {
-        map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
-        select: SelectStage::new(&job.params),
+        select: SelectStage::new(&job.params, map.first_id()),
+        map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames)
+            .saving(autosave),
         geometry: GeometryStage::new(model),
-        track: TrackStage::new(&job.params.track, job.is_live),
+        track,
         source: SourceStage::new(job.source, job.stop),
         subscriber,
     };

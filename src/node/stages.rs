@@ -10,6 +10,7 @@ use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
+use crate::node::autosave::Autosave;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
 use crate::select::{Batcher, Selector};
@@ -55,6 +56,7 @@ pub(super) struct MapStage {
     n_frames: Option<u64>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
+    autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
@@ -87,9 +89,9 @@ impl SourceStage {
 }
 
 impl SelectStage {
-    pub(super) fn new(params: &Params) -> Self {
+    pub(super) fn new(params: &Params, first_id: u32) -> Self {
         Self {
-            selector: Selector::new(params.select.clone()),
+            selector: Selector::new(params.select.clone()).counting_from(first_id),
             batcher: Batcher::new(&params.select),
             n_selected: 0,
             frame_stamps: Vec::new(),
@@ -174,12 +176,18 @@ impl MapStage {
             stop,
             n_frames,
             unpublished: BTreeMap::new(),
+            autosave: None,
             since_snapshot: Stopwatch::start(),
             n_keyframes: 0,
             optimise_secs: 0.0,
             keyframe_to_pose_secs: Vec::new(),
             keyframe_to_snapshot_secs: Vec::new(),
         }
+    }
+
+    pub(super) fn saving(mut self, autosave: Option<Autosave>) -> Self {
+        self.autosave = autosave;
+        self
     }
 
     /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end.
@@ -241,6 +249,10 @@ impl MapStage {
             self.map.refine_held_out();
         }
         self.optimise_secs += watch.secs();
+        // What the run directory gets at the end must not be overtaken by an older copy.
+        if let Some(autosave) = self.autosave.take() {
+            autosave.finish();
+        }
         let snapshot = self.snapshot();
         publish(Arc::clone(&snapshot), self.progress());
         snapshot
@@ -277,6 +289,18 @@ impl MapStage {
         if self.since_snapshot.secs() >= self.params.snapshot_secs && self.map.n_splats() > 0 {
             let snapshot = self.snapshot();
             publish(snapshot, self.progress());
+        }
+        self.autosave_if_due();
+    }
+
+    fn autosave_if_due(&mut self) {
+        let is_due = self.autosave.as_ref().is_some_and(Autosave::is_due);
+        if is_due && self.map.n_splats() > 0 {
+            let snapshot = self.map.snapshot();
+            let checkpoint = self.map.checkpoint(&snapshot, Vec::new());
+            if let Some(autosave) = &mut self.autosave {
+                autosave.save(checkpoint);
+            }
         }
     }
 

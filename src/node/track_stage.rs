@@ -35,6 +35,8 @@ pub(super) struct TrackStage {
     secs: f64,
     frame_secs: VecDeque<f64>,
     latency_secs: VecDeque<f64>,
+    /// Who keeps landmarks for a map file that is written while the run goes on, how often, and since when.
+    saved_to: Option<(Sender<Vec<u8>>, f64, Stopwatch)>,
 }
 
 /// What tracking leaves behind.
@@ -61,6 +63,35 @@ impl TrackStage {
             secs: 0.0,
             frame_secs: VecDeque::new(),
             latency_secs: VecDeque::new(),
+            saved_to: None,
+        }
+    }
+
+    /// Begins in a map that was saved, without an idea of where.
+    pub(super) fn begin_in(&mut self, saved: &[u8], params: &TrackParams) -> anyhow::Result<()> {
+        if self.tracker.is_some() && !saved.is_empty() {
+            let tracker = Tracker::in_saved(saved, params).map_err(anyhow::Error::msg)?;
+            self.tracker = Some(tracker);
+        }
+        Ok(())
+    }
+
+    /// From now on tells landmarks every `secs`.
+    pub(super) fn tell_landmarks(&mut self, secs: f64, to: Sender<Vec<u8>>) {
+        self.saved_to = Some((to, secs, Stopwatch::start()));
+    }
+
+    fn save_if_due(&mut self) {
+        let Some((to, secs, since)) = &mut self.saved_to else {
+            return;
+        };
+        // A little ahead of the map file that they are for.
+        if since.secs() < 0.5 * *secs {
+            return;
+        }
+        *since = Stopwatch::start();
+        if let Some(Ok(landmarks)) = self.tracker.as_ref().map(Tracker::saved) {
+            drop(to.send(landmarks));
         }
     }
 
@@ -92,6 +123,7 @@ impl TrackStage {
         if !self.is_live {
             tracker.look_again(usize::MAX);
         }
+        self.save_if_due();
         self.secs += watch.secs();
     }
 

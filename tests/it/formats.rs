@@ -90,9 +90,8 @@ pub(crate) fn random_snapshot(
 fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
     Checkpoint {
         landmarks: vec![7; 33],
-        snapshot: random_snapshot(n_splats, 5, sh_degree, 9),
-        seed: 11,
-        steps: 3000,
+        ages: (0..n_splats as u16).collect(),
+        ..Checkpoint::of(random_snapshot(n_splats, 5, sh_degree, 9), 11, 3000)
     }
 }
 
@@ -116,6 +115,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         );
         assert_eq!((back.seed, back.steps), (11, 3000));
         assert_eq!(back.landmarks, written.landmarks);
+        assert_eq!(back.ages, written.ages);
     }
 }
 
