@@ -118,7 +118,11 @@ impl SplatMap {
         if self.params.max_gpu_mib == 0 {
             return by_number;
         }
-        let by_bytes = self.engine.room_within(self.params.max_gpu_mib << 20);
+        let by_bytes = {
+            let budget = self.params.max_gpu_mib << 20;
+            let kept = self.bytes_for_views();
+            self.engine.room_within(budget.saturating_sub(kept))
+        };
         if by_bytes < by_number && self.engine.n_splats() >= by_bytes {
             if self.peaks.n_refused == 0 {
                 tracing::warn!(

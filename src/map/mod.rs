@@ -7,6 +7,7 @@ pub mod align;
 pub mod checkpoint;
 mod depth_scale;
 pub mod figures;
+mod framing;
 mod gauge;
 mod growth;
 mod held_out;
@@ -88,7 +89,7 @@ pub struct SplatMap {
     past: Option<Past>,
     /// The model's lengths are metres.
     knows_metres: bool,
-    /// What memory has no room for: splats, pictures, and where both go.
+    /// What memory has no room for: splats, and pictures, both in a file in `folder`.
     regions: Regions,
     disk: Disk,
     folder: Option<PathBuf>,
@@ -173,7 +174,7 @@ impl SplatMap {
             self.take_over()
         });
         let fresh = self.place(own, geometry.pose_error);
-        self.hold_keyframes();
+        self.hold_keyframes(0);
         self.match_views();
         self.set_gauge();
         self.note_peaks();
@@ -323,6 +324,7 @@ impl SplatMap {
         self.pose_error[1] =
             self.pose_error[1].max((pose_error.translation * map_from_model.scale) as f32);
         self.pose_error[0] = self.pose_error[0].max(pose_error.rotation_rad as f32);
+        self.hold_keyframes(self.n_unplaced(&views));
         let mut fresh = Vec::new();
         for view in views {
             let given = self.keyframes.placed.get(&view.keyframe_id);

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use rand::RngExt;
 
 use crate::frame::{DepthMap, RgbImage};
+use crate::geometry::View;
 use crate::map::SplatMap;
 use crate::map::keyframes::Placed;
 use crate::map::saved_view::{self, Content, SavedView};
@@ -16,8 +17,8 @@ use crate::map::spill::{Slot, Spill};
 /// The newest keyframes that never rest and, of those that memory has room for, the share that is for the newest.
 const N_NEWEST: usize = 8;
 const NEWEST_SHARE: f64 = 0.5;
-/// Share of `map.max_gpu_mib` that views may take; the rest is for splats.
-const VIEWS_SHARE: f64 = 0.5;
+/// Views may take one part of so many of `map.max_gpu_mib`; the rest is for splats.
+const VIEWS_SHARE: usize = 2;
 /// Steps between turns, and keyframes that come back in one.
 pub(super) const TURN_EVERY: u64 = 50;
 const N_PER_TURN: usize = 2;
@@ -92,11 +93,12 @@ impl SplatMap {
         self
     }
 
-    /// Keeps as many keyframes in memory as there may be.
-    pub(super) fn hold_keyframes(&mut self) {
+    /// Keeps as many keyframes in memory as there may be, less room for those that come.
+    pub(super) fn hold_keyframes(&mut self, n_coming: usize) {
         let n_here = self.n_here();
         self.disk.peak_here = self.disk.peak_here.max(n_here);
-        let n_over = n_here.saturating_sub(self.max_here());
+        let most = self.max_here().saturating_sub(n_coming);
+        let n_over = n_here.saturating_sub(most);
         for id in self.leaving(n_over) {
             self.leave(id);
         }
@@ -242,6 +244,12 @@ impl SplatMap {
         placed.filter_map(view).collect()
     }
 
+    /// Views of keyframes that come into the map with them.
+    pub(super) fn n_unplaced(&self, views: &[View]) -> usize {
+        let is_new = |view: &&View| !self.has_keyframe(view.keyframe_id);
+        views.iter().filter(is_new).count()
+    }
+
     pub(super) fn n_here(&self) -> usize {
         let placed = self.keyframes.placed.values();
         placed.filter(|p| p.home.is_here).count()
@@ -253,20 +261,28 @@ impl SplatMap {
             0 => usize::MAX,
             n => n,
         };
-        let budget = (self.params.max_gpu_mib << 20) as f64 * VIEWS_SHARE;
-        let of_view = |p: &Placed| (4 * p.image.pixels.len() / 3 + 8 * p.depth.depth.len()) as f64;
-        let here = self.keyframes.placed.values().rev();
-        let widest = here
-            .filter(|p| p.home.is_here)
-            .take(N_NEWEST)
-            .map(of_view)
-            .fold(1.0, f64::max);
-        let by_bytes = if budget > 0.0 {
-            (budget / widest) as usize
-        } else {
-            usize::MAX
+        let budget = (self.params.max_gpu_mib << 20) as usize / VIEWS_SHARE;
+        let by_bytes = match budget {
+            0 => usize::MAX,
+            budget => budget / self.bytes_of_view(),
         };
         by_number.min(by_bytes).max(N_NEWEST)
+    }
+
+    /// Bytes of `map.max_gpu_mib` that are kept for views that are still to come.
+    pub(super) fn bytes_for_views(&self) -> u64 {
+        let budget = (self.params.max_gpu_mib << 20) as usize / VIEWS_SHARE;
+        let here = self.n_here() * self.bytes_of_view();
+        let most = self.max_here().saturating_mul(self.bytes_of_view());
+        budget.min(most).saturating_sub(here) as u64
+    }
+
+    /// As the engine has one: four bytes a pixel, eight a depth. The largest of the newest that are in memory.
+    fn bytes_of_view(&self) -> usize {
+        let of_view = |p: &Placed| 4 * p.image.pixels.len() / 3 + 8 * p.depth.depth.len();
+        let placed = self.keyframes.placed.values().rev();
+        let here = placed.filter(|p| p.home.is_here).take(N_NEWEST);
+        here.map(of_view).max().unwrap_or(1).max(1)
     }
 
     fn newest_ids(&self, n: usize) -> Vec<u32> {
