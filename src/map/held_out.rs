@@ -23,7 +23,7 @@ impl SplatMap {
         let last = self.step_settings(Phase::Final(1.0));
         for id in self.held_out() {
             let was_here = self.is_here(id);
-            if !self.come(id) {
+            if !self.visit(id) {
                 continue;
             }
             let view_ix = self.keyframes.placed[&id].view_ix;
@@ -72,7 +72,7 @@ impl SplatMap {
     /// What the map shows from a keyframe, beside the picture that was taken there.
     pub fn render_keyframe(&mut self, keyframe_id: u32) -> Option<(Rendering, Arc<RgbImage>)> {
         let was_here = self.is_here(keyframe_id);
-        if !self.come(keyframe_id) {
+        if !self.visit(keyframe_id) {
             return None;
         }
         let image = Arc::clone(&self.keyframes.placed.get(&keyframe_id)?.image);

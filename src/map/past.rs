@@ -200,7 +200,9 @@ impl SplatMap {
         self.measure_scene();
         let away = self.distances();
         self.engine.append(splats);
-        self.engine.set_ages(0, ages);
+        if !ages.is_empty() {
+            self.engine.set_ages(0, ages);
+        }
         let n_over = self.engine.n_splats().saturating_sub(self.most_splats());
         if n_over > 0 {
             self.evict_far(n_over, -1.0, &away);
@@ -319,7 +321,12 @@ impl SplatMap {
 
     fn sight(&mut self, past: &mut Past, keyframe: &Keyframe, view: &View) -> Option<Sight> {
         let tracker = past.tracker.as_mut()?;
-        let tracked = tracker.track(&keyframe.frame);
+        let mut frame = keyframe.frame.clone();
+        // An uncalibrated camera may be another one than the map's: what the model found of it is the better guess.
+        if frame.intrinsics.is_none() && view.lens.is_none() {
+            frame.intrinsics = Some(view.intrinsics);
+        }
+        let tracked = tracker.track(&frame);
         let map_from_cam = tracked.pose.filter(|_| tracked.is_measured())?.map_from_cam;
         let image = &keyframe.frame.image;
         let shrunk = f64::from(self.params.max_side)

@@ -104,11 +104,16 @@ impl SplatMap {
             let n_over = n + n_wanted + of_back + spare - most.min(n + n_wanted + of_back + spare);
             self.evict_far(n_over, FAR * depth, &away);
         }
+        let n_before = self.regions.n_restored;
         for (_, id) in back {
             let room = most.saturating_sub(self.engine.n_splats());
             if self.regions.on_disk[&id].n_splats <= room {
                 self.restore(id);
             }
+        }
+        if self.regions.n_restored > n_before {
+            self.choose_trainable();
+            self.note_peaks();
         }
     }
 
@@ -228,7 +233,6 @@ impl SplatMap {
             }
             Err(e) => self.lose(region.n_splats, &e.to_string()),
         }
-        self.choose_trainable();
     }
 
     /// Regions on disk as they lie in the map by now, for files.

@@ -42,7 +42,7 @@ pub struct Home {
 #[derive(Debug, Default)]
 pub(super) struct Disk {
     spill: Option<Spill>,
-    has_failed: bool,
+    has_warned: bool,
     turn: u64,
     pub(super) n_lost: u64,
     pub(super) peak_here: usize,
@@ -60,9 +60,6 @@ impl Home {
 impl SplatMap {
     /// Writes a record beside the run; `None`, said once, where that is not possible.
     pub(super) fn spilled(&mut self, bytes: &[u8]) -> Option<Slot> {
-        if self.disk.has_failed {
-            return None;
-        }
         let limit = self.params.max_disk_mib << 20;
         let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
         let spill = match &self.disk.spill {
@@ -78,11 +75,13 @@ impl SplatMap {
             Ok(None) => format!("map.max_disk_mib = {} is used up", self.params.max_disk_mib),
             Err(e) => e.to_string(),
         };
-        self.disk.has_failed = true;
-        tracing::warn!(
-            "what memory has no room for cannot be kept on disk: {reason}: {}",
-            folder.display()
-        );
+        if !self.disk.has_warned {
+            tracing::warn!(
+                "what memory has no room for cannot be kept on disk: {reason}; said once: {}",
+                folder.display()
+            );
+            self.disk.has_warned = true;
+        }
         None
     }
 
@@ -142,6 +141,15 @@ impl SplatMap {
             self.come(id);
         }
         self.choose_trainable();
+    }
+
+    /// The same for a moment: another makes room for it. Whoever visits sends it away again.
+    pub(super) fn visit(&mut self, id: u32) -> bool {
+        let placed = self.keyframes.placed.get(&id);
+        if placed.is_some_and(|p| !p.home.is_here && p.home.copy.is_some()) {
+            self.hold_keyframes(1);
+        }
+        self.come(id)
     }
 
     /// Picture and depth come into memory. Returns whether they are there.

@@ -14,8 +14,10 @@ use splat_mapper::map::schedule::Phase;
 use splat_mapper::map::snapshot::Scale;
 use splat_mapper::source::Source;
 use splat_mapper::source::synthetic::endless::EndlessSource;
+use splat_mapper::splat::Engine;
 use splat_mapper::splat::cpu::CpuEngine;
-use splat_mapper::track::Tracker;
+
+use crate::gpu_runs::gpu_engine;
 
 const MAX_SPLATS: usize = 3000;
 const MAX_KEYFRAMES: usize = 48;
@@ -45,12 +47,16 @@ struct Walk {
 
 impl Walk {
     fn new(corridor: &str, params: MapParams) -> Self {
+        Self::on(Box::new(CpuEngine::new()), corridor, params)
+    }
+
+    fn on(engine: Box<dyn Engine>, corridor: &str, params: MapParams) -> Self {
         let all = Settings::shipped().params().unwrap();
         let model = Known::new(all.known, (&all.sfm, &all.mvs), Some(1.0), 7).unwrap();
         Self {
             source: EndlessSource::open(corridor).unwrap(),
             model,
-            map: SplatMap::new(params, 3, Scale::GIVEN, Box::new(CpuEngine::new())),
+            map: SplatMap::new(params, 3, Scale::GIVEN, engine),
             next_id: 0,
             batch_id: 0,
         }
@@ -148,7 +154,6 @@ fn check_load(saved: checkpoint::Checkpoint) {
     assert!(map.n_splats() <= MAX_SPLATS);
     assert_eq!(map.n_splats() as u64 + budgets.splats_on_disk, in_all);
     assert!(budgets.peak_keyframes_in_ram <= MAX_KEYFRAMES as u64);
-    drop(Tracker::new(&track));
 }
 
 #[test]
@@ -188,4 +193,36 @@ fn the_engine_stays_within_its_bytes() {
     assert!(budgets.peak_engine_mib <= 1.05, "{budgets:?}");
     assert!(budgets.growth_refused > 0, "{budgets:?}");
     assert!(budgets.peak_splats > 300, "{budgets:?}");
+}
+
+#[test]
+fn on_a_gpu_splats_and_pictures_leave_and_come_back_as_well() {
+    let small = MapParams {
+        max_gpu_mib: 16,
+        max_splats: 500,
+        seeds_per_keyframe: 60,
+        max_keyframes_in_ram: 12,
+        max_side: 48,
+        ..params()
+    };
+    let corridor = "endless?frames=400&turn=200&width=48&height=36";
+    let mut walk = Walk::on(Box::new(gpu_engine(true)), corridor, small);
+    let mut before = 0.0;
+    while walk.go() {
+        assert!(walk.map.n_splats() <= 500);
+        if walk.next_id == 30 {
+            before = walk.quality(5..15);
+        }
+    }
+    let budgets = walk.map.budgets();
+    let after = walk.quality(5..15);
+    eprintln!("{budgets:?}; {before:.2} dB, then {after:.2} dB");
+    assert_eq!(walk.map.fault(), None);
+    assert!(budgets.peak_engine_mib <= 16.0 * 1.05, "{budgets:?}");
+    assert!(
+        budgets.evicted_splats > 0 && budgets.restored_splats > 0,
+        "{budgets:?}"
+    );
+    assert!(budgets.peak_keyframes_in_ram <= 12, "{budgets:?}");
+    assert!(after > before - 1.0);
 }

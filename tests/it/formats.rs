@@ -133,7 +133,7 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
         end += 16 + n;
     }
     assert_eq!(boundaries.pop(), Some(bytes.len()));
-    assert_eq!(boundaries.len(), 5 + 4 * 4 - 1);
+    assert_eq!(boundaries.len(), 5 + 4 * 7 - 1);
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {
