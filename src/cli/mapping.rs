@@ -11,8 +11,8 @@ use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
 use crate::node::localise;
-use crate::node::pipeline::{self, Subscriber};
-use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
+use crate::node::pipeline;
+use crate::node::{Job, Outcome, Progress, Stop, linger, outbox, run_dir};
 use crate::source;
 
 pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
@@ -83,15 +83,16 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     stop_on_ctrl_c(&stop)?;
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
+    let told = &found.tracking;
     if args.json {
         say(serde_json::to_string_pretty(&found)?);
     } else {
         say(format!(
             "{} of {} frames found among {} keyframes, {} times lost, {} times found again",
-            found.tracked, found.frames, found.map_keyframes, found.lost, found.relocalised
+            told.tracked, told.frames, found.map_keyframes, told.lost, told.relocalised
         ));
     }
-    if found.tracked == 0 {
+    if told.tracked == 0 {
         let reason = found
             .reason
             .unwrap_or_else(|| "there are no frames".to_owned());
@@ -133,7 +134,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let source = source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
-    let subscriber: Option<Box<dyn Subscriber>> = subscriber(&params.publish)?;
+    let outbox = outbox(&params)?;
     let is_live = params.source.rate > 0.0;
     let job = Job {
         source,
@@ -141,9 +142,10 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         is_live,
         stop: stop.clone(),
         out: out.map(Path::to_owned),
+        outbox,
     };
     let bar = bar(is_terminal);
-    let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
+    let outcome = pipeline::run(job, &mut |progress| show(&bar, progress));
     bar.finish_and_clear();
     let mut outcome = outcome?;
     let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;

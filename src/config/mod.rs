@@ -7,6 +7,7 @@ pub mod align;
 mod file;
 mod known;
 pub mod onnx;
+mod publish;
 mod range;
 pub mod scale;
 pub mod track;
@@ -19,6 +20,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 pub use self::known::KnownParams;
+pub use self::publish::{PublishParams, TfMode};
 use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
 use crate::config::range::{Range, ranges_of_comments};
@@ -220,20 +222,6 @@ pub struct MapParams {
 #[serde(deny_unknown_fields)]
 pub struct EvalParams {
     pub lpips_model: String,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PublishParams {
-    pub zenoh: bool,
-    pub zenoh_listen: String,
-    pub zenoh_connect: String,
-    pub zenoh_config: String,
-    pub scouting: bool,
-    pub domain_id: u32,
-    pub namespace: String,
-    pub chunk_bytes: usize,
-    pub linger_secs: f64,
 }
 
 /// Values by dotted key; every key of the embedded file is there.

@@ -185,6 +185,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
         stamp: meta.stamp,
         scale: meta.scale,
         poses: keyframes.ok_or_else(|| missing("KEYF"))?,
+        splat_ids: Arc::new((0..splats.len() as u32).collect()),
         splats: Arc::new(splats),
     };
     Ok(Checkpoint {

@@ -8,7 +8,7 @@ use crate::map::schedule::Phase;
 use crate::map::seed::{self, SeedView};
 use crate::map::transient;
 use crate::pose::Rigid;
-use crate::splat::{McmcSettings, Rendering};
+use crate::splat::{McmcSettings, Rendering, Splats};
 
 /// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
 /// is not under optimisation, and its splats are no measure of anything.
@@ -71,7 +71,7 @@ impl SplatMap {
         seeds.truncate(room);
         if !seeds.is_empty() {
             self.engine.append(&seeds);
-            self.note_peaks();
+            self.number_splats();
         }
     }
 
@@ -85,7 +85,7 @@ impl SplatMap {
             .map(|i| splats.is_finite(i) && is_alive(i))
             .collect();
         if keep.iter().any(|k| !k) {
-            self.engine.retain(&keep);
+            self.retain(&keep);
         }
     }
 
@@ -100,7 +100,29 @@ impl SplatMap {
             seed: (self.seed ^ self.n_steps) as u32,
         };
         self.engine.relocate_and_grow(&settings);
+        self.number_splats();
+    }
+
+    /// After splats were added.
+    pub(super) fn number_splats(&mut self) {
+        if self.ids.grow_to(self.engine.n_splats()) {
+            self.epoch += 1;
+        }
         self.note_peaks();
+    }
+
+    pub(super) fn retain(&mut self, keep: &[bool]) {
+        self.engine.retain(keep);
+        self.ids.retain(keep);
+    }
+
+    /// Clients and viewers rely on finite numbers.
+    pub(super) fn finite_splats(&mut self) -> (Splats, Vec<u32>) {
+        let splats = self.engine.splats();
+        let ids = self.ids.all();
+        let finite = (0..splats.len()).filter(|i| splats.is_finite(*i));
+        let ids = finite.map(|i| ids[i]).collect();
+        (splats.into_finite(), ids)
     }
 
     /// While the end is known to be far, part of the room is kept for what is still to be seen.

@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use crate::camera::Intrinsics;
 use crate::clock::Stamp;
 use crate::frame::RgbImage;
 use crate::geometry::Health;
 use crate::map::SplatMap;
 use crate::map::schedule::Phase;
+use crate::pose::Rigid;
 use crate::splat::{PoseStep, Rendering, StepSettings};
 
 /// Steps that refine the pose of one held-out view, and the share of the rate at the last (3R-GS: 100 steps, to 1 %).
@@ -67,6 +69,15 @@ impl SplatMap {
                 )
             })
             .collect()
+    }
+
+    /// The map from any place; `None` while there is none.
+    pub fn render(&mut self, map_from_cam: &Rigid, intrinsics: &Intrinsics) -> Option<Rendering> {
+        let sh_degree = self.params.sh_degree;
+        (self.engine.n_splats() > 0).then(|| {
+            self.engine
+                .render(intrinsics, &map_from_cam.inverse(), sh_degree)
+        })
     }
 
     /// What the map shows from a keyframe, beside the picture that was taken there.

@@ -11,6 +11,7 @@ mod framing;
 mod gauge;
 mod growth;
 mod held_out;
+mod ids;
 pub mod keyframes;
 mod laid_over;
 pub mod layout;
@@ -42,6 +43,7 @@ use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::figures::Peaks;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
+use crate::map::ids::SplatIds;
 use crate::map::keyframes::{Keyframes, Placed};
 use crate::map::past::Past;
 use crate::map::regions::Regions;
@@ -63,6 +65,7 @@ const LAST_RESEED: f32 = 0.6;
 pub struct SplatMap {
     params: MapParams,
     engine: Box<dyn Engine>,
+    ids: SplatIds,
     schedule: Schedule,
     rng: Pcg64Mcg,
     keyframes: Keyframes,
@@ -101,12 +104,8 @@ pub struct SplatMap {
 
 impl std::fmt::Debug for SplatMap {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "SplatMap({} keyframes, {} splats)",
-            self.keyframes.placed.len(),
-            self.engine.n_splats()
-        )
+        let (n_keyframes, n_splats) = (self.n_keyframes(), self.n_splats());
+        write!(f, "SplatMap({n_keyframes} keyframes, {n_splats} splats)")
     }
 }
 
@@ -115,6 +114,7 @@ impl SplatMap {
         Self {
             params,
             engine,
+            ids: SplatIds::default(),
             schedule: Schedule::new(seed),
             rng: Pcg64Mcg::seed_from_u64(seed ^ 0x5eed_0002),
             keyframes: Keyframes::default(),
@@ -244,6 +244,7 @@ impl SplatMap {
         let first_own = poses.partition_point(|pose| pose.keyframe_id < self.first_id());
         self.scale = self.measure_scale(&poses[first_own..]);
         self.revision += 1;
+        let (splats, splat_ids) = self.finite_splats();
         Arc::new(Snapshot {
             map_id: self.map_id(),
             epoch: self.epoch,
@@ -251,7 +252,8 @@ impl SplatMap {
             stamp: poses.last().map(|pose| pose.stamp).unwrap_or_default(),
             scale: self.scale,
             poses,
-            splats: Arc::new(self.engine.splats().into_finite()),
+            splats: Arc::new(splats),
+            splat_ids: Arc::new(splat_ids),
         })
     }
 

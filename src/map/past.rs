@@ -200,6 +200,7 @@ impl SplatMap {
         self.measure_scene();
         let away = self.distances();
         self.engine.append(splats);
+        self.number_splats();
         if !ages.is_empty() {
             self.engine.set_ages(0, ages);
         }
@@ -212,7 +213,7 @@ impl SplatMap {
             tracing::warn!("{n_over} splats of the saved map have no room and are left out");
             let n = self.engine.n_splats();
             let keep: Vec<bool> = (0..n).map(|ix| ix < n - n_over).collect();
-            self.engine.retain(&keep);
+            self.retain(&keep);
         }
     }
 

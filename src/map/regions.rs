@@ -183,7 +183,7 @@ impl SplatMap {
             self.merge_evicted(evicted);
             rows.iter().for_each(|ix| keep[*ix] = false);
         }
-        self.engine.retain(&keep);
+        self.retain(&keep);
         self.choose_trainable();
     }
 
@@ -228,6 +228,7 @@ impl SplatMap {
             Ok((splats, ages)) => {
                 let first = self.engine.n_splats();
                 self.engine.append(&splats);
+                self.number_splats();
                 self.engine.set_ages(first, &ages);
                 self.regions.n_restored += splats.len() as u64;
             }

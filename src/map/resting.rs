@@ -252,6 +252,11 @@ impl SplatMap {
         placed.filter_map(view).collect()
     }
 
+    /// Whether every keyframe has its picture in memory.
+    pub fn has_all_pictures(&self) -> bool {
+        self.n_here() == self.n_keyframes()
+    }
+
     /// Views of keyframes that come into the map with them.
     pub(super) fn n_unplaced(&self, views: &[View]) -> usize {
         let is_new = |view: &&View| !self.has_keyframe(view.keyframe_id);

@@ -138,4 +138,6 @@ pub struct Snapshot {
     /// In order of keyframe id.
     pub poses: Vec<KeyframePose>,
     pub splats: Arc<Splats>,
+    /// One per splat, ascending; a splat keeps its number as long as the map has it.
+    pub splat_ids: Arc<Vec<u32>>,
 }

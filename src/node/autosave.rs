@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use crate::clock::Stopwatch;
 use crate::map::checkpoint::{self, Checkpoint};
 use crate::node::spawn;
-use crate::queue::{Receiver, Sender, WhenFull, queue};
+use crate::queue::{Sender, WhenFull, queue};
 
 /// The side of the map thread.
 #[derive(Debug)]
@@ -20,29 +20,17 @@ pub struct Autosave {
     writer: Option<JoinHandle<u64>>,
 }
 
-/// Tells landmarks of the tracker, which lives on another thread.
-pub type Landmarks = Receiver<Vec<u8>>;
-
 impl Autosave {
     /// Writes `out/map.splatmap` every `every_secs`; `None` where nobody asks for it.
-    pub fn start(
-        out: Option<&Path>,
-        every_secs: f64,
-        landmarks: Landmarks,
-    ) -> anyhow::Result<Option<Self>> {
+    pub fn start(out: Option<&Path>, every_secs: f64) -> anyhow::Result<Option<Self>> {
         let Some(out) = out.filter(|_| every_secs > 0.0) else {
             return Ok(None);
         };
         let path = out.join("map.splatmap");
         let (copies, taken) = queue::<Box<Checkpoint>>("autosave", 1, WhenFull::DropOldest);
         let writer = spawn("autosave", move || {
-            let mut newest = Vec::new();
             let mut n_written = 0;
-            while let Some(mut checkpoint) = taken.recv() {
-                while let Ok(Some(told)) = landmarks.try_recv() {
-                    newest = told;
-                }
-                checkpoint.landmarks.clone_from(&newest);
+            while let Some(checkpoint) = taken.recv() {
                 match checkpoint::write(&checkpoint, &path) {
                     Ok(()) => n_written += 1,
                     // The next one may find room; the run goes on.

@@ -31,6 +31,7 @@ use crate::map::checkpoint;
 use crate::map::layout::map_sha256;
 use crate::memory::peak_rss_mib;
 use crate::node::Outcome;
+use crate::node::track_stage::Tracking;
 use crate::splat::Rendering;
 
 /// Training views whose quality is measured: enough for a mean, few enough for long recordings.
@@ -103,7 +104,7 @@ pub fn finish(
     let keyframes = timed_keyframes(outcome);
     let rows = frames::rows(&keyframes, tracks, &outcome.frame_stamps);
     let report = Report {
-        tracking: tracking_figures(outcome, &rows),
+        tracking: tracking_figures(&outcome.tracking, &rows),
         ..report(outcome, settings, quality)
     };
     if let Some(out) = out {
@@ -302,8 +303,8 @@ fn timed_keyframes(outcome: &Outcome) -> Vec<TimedPose> {
     outcome.own_poses().iter().map(timed).collect()
 }
 
-fn tracking_figures(outcome: &Outcome, rows: &[FrameRow]) -> TrackingFigures {
-    let tracking = &outcome.tracking;
+/// `rows` are those of the same run.
+pub(super) fn tracking_figures(tracking: &Tracking, rows: &[FrameRow]) -> TrackingFigures {
     let n_known = |wanted: &[Known]| {
         let found = rows.iter().filter(|row| wanted.contains(&row.source));
         found.count() as u64

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -11,8 +12,10 @@ use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
 use crate::node::autosave::Autosave;
+use crate::node::outward::Clerk;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
+use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
 use crate::source::{Source, SourceCounts};
 
@@ -27,6 +30,7 @@ const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 pub(super) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
+    outbox: Option<Arc<Outbox>>,
     pub(super) decode_secs: f64,
 }
 
@@ -54,9 +58,11 @@ pub(super) struct MapStage {
     is_live: bool,
     stop: Stop,
     n_frames: Option<u64>,
+    pub(super) clerk: Clerk,
+    outbox: Option<Arc<Outbox>>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
-    autosave: Option<Autosave>,
+    pub(super) autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
@@ -65,22 +71,47 @@ pub(super) struct MapStage {
 }
 
 impl SourceStage {
-    pub(super) fn new(source: Box<dyn Source>, stop: Stop) -> Self {
+    pub(super) fn new(source: Box<dyn Source>, stop: Stop, outbox: Option<Arc<Outbox>>) -> Self {
         Self {
             source,
             stop,
+            outbox,
             decode_secs: 0.0,
         }
     }
 
+    /// While paused, frames come and go.
     pub(super) fn next(&mut self) -> Option<Frame> {
-        if self.stop.is_asked() {
-            return None;
+        loop {
+            if self.stop.is_asked() {
+                return None;
+            }
+            let watch = Stopwatch::start();
+            let frame = self.source.next();
+            self.decode_secs += watch.secs();
+            let Some(outbox) = self.outbox.as_ref() else {
+                return frame;
+            };
+            let Some(frame) = frame else {
+                outbox.note(|standing| standing.has_ended = true);
+                return None;
+            };
+            outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
+            let switches = outbox.switches();
+            if switches.wants_reset.swap(false, Ordering::Relaxed) {
+                self.stop.ask_restart();
+                return None;
+            }
+            let is_paused = switches.is_paused.load(Ordering::Relaxed);
+            outbox.note(|standing| standing.is_paused = is_paused);
+            if !is_paused {
+                return Some(frame);
+            }
         }
-        let watch = Stopwatch::start();
-        let frame = self.source.next();
-        self.decode_secs += watch.secs();
-        frame
+    }
+
+    pub(super) fn into_source(self) -> Box<dyn Source> {
+        self.source
     }
 
     pub(super) fn counts(&self) -> SourceCounts {
@@ -165,16 +196,19 @@ impl MapStage {
     pub(super) fn new(
         map: SplatMap,
         params: &Params,
-        is_live: bool,
+        (is_live, n_frames): (bool, Option<u64>),
         stop: Stop,
-        n_frames: Option<u64>,
+        outbox: Option<Arc<Outbox>>,
     ) -> Self {
+        let calls = outbox.as_ref().and_then(|outbox| outbox.take_calls());
         Self {
             map,
             params: params.map.clone(),
             is_live,
             stop,
             n_frames,
+            clerk: Clerk::new(calls, &params.track),
+            outbox,
             unpublished: BTreeMap::new(),
             autosave: None,
             since_snapshot: Stopwatch::start(),
@@ -183,11 +217,6 @@ impl MapStage {
             keyframe_to_pose_secs: Vec::new(),
             keyframe_to_snapshot_secs: Vec::new(),
         }
-    }
-
-    pub(super) fn saving(mut self, autosave: Option<Autosave>) -> Self {
-        self.autosave = autosave;
-        self
     }
 
     /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end.
@@ -213,10 +242,15 @@ impl MapStage {
         let watch = Stopwatch::start();
         for id in self.map.add(batch, geometry, progress) {
             if let Some(age) = self.unpublished.get(&id) {
-                self.keyframe_to_pose_secs.push(age.secs());
+                let secs = age.secs();
+                self.keyframe_to_pose_secs.push(secs);
+                if let Some(outbox) = &self.outbox {
+                    outbox.note(|standing| standing.keyframe_to_pose.note(secs));
+                }
             }
         }
         self.optimise_secs += watch.secs();
+        self.note();
         if !self.is_live {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
@@ -254,8 +288,34 @@ impl MapStage {
             autosave.finish();
         }
         let snapshot = self.snapshot();
-        publish(Arc::clone(&snapshot), self.progress());
+        self.note();
+        let last = Progress {
+            has_ended: true,
+            ..self.progress()
+        };
+        publish(Arc::clone(&snapshot), last);
         snapshot
+    }
+
+    /// Calls from outside, while nothing else is to be done.
+    pub(super) fn serve(&mut self) {
+        self.clerk.serve(&mut self.map);
+    }
+
+    /// Writes the map's part of the status.
+    fn note(&self) {
+        let Some(outbox) = &self.outbox else { return };
+        let (map, optimise_secs) = (&self.map, self.optimise_secs);
+        outbox.note(|standing| {
+            standing.n_placed = map.n_keyframes() as u64;
+            standing.n_components = map.components().len() as u64;
+            standing.n_splats = map.n_splats() as u64;
+            standing.n_steps = map.n_steps();
+            standing.gpu_bytes = map.peak_gpu_bytes();
+            if optimise_secs > 0.0 {
+                standing.steps_per_s = map.n_steps() as f64 / optimise_secs;
+            }
+        });
     }
 
     fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
@@ -281,6 +341,7 @@ impl MapStage {
             if self.map.step(n, phase(self.map.n_steps())) == 0 {
                 break;
             }
+            self.clerk.serve(&mut self.map);
             self.snapshot_if_due(publish);
         }
     }
@@ -297,7 +358,8 @@ impl MapStage {
         let is_due = self.autosave.as_ref().is_some_and(Autosave::is_due);
         if is_due && self.map.n_splats() > 0 {
             let snapshot = self.map.snapshot();
-            let checkpoint = self.map.checkpoint(&snapshot, Vec::new());
+            let landmarks = self.clerk.landmarks().to_vec();
+            let checkpoint = self.map.checkpoint(&snapshot, landmarks);
             if let Some(autosave) = &mut self.autosave {
                 autosave.save(checkpoint);
             }
@@ -305,6 +367,7 @@ impl MapStage {
     }
 
     fn snapshot(&mut self) -> Arc<Snapshot> {
+        self.note();
         let snapshot = self.map.snapshot();
         self.since_snapshot = Stopwatch::start();
         for pose in &snapshot.poses {
@@ -326,6 +389,7 @@ impl MapStage {
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
             steps_planned: if self.is_live { 0 } else { self.params.steps },
+            has_ended: false,
         }
     }
 }

@@ -327,24 +327,29 @@ impl Splats {
         self.sh.truncate(n * stride);
     }
 
+    /// Appends splat `i` of others of the same SH degree.
+    pub fn push(&mut self, others: &Self, i: usize) {
+        let stride = self.sh_stride();
+        self.means.push(others.means[i]);
+        self.log_scales.push(others.log_scales[i]);
+        self.quats.push(others.quats[i]);
+        self.opacity_logits.push(others.opacity_logits[i]);
+        self.anchors.push(others.anchors[i]);
+        self.sh
+            .extend_from_slice(&others.sh[i * stride..(i + 1) * stride]);
+    }
+
     /// Only splats whose every number is finite: clients and viewers rely on it.
     pub fn into_finite(self) -> Self {
         if (0..self.len()).all(|i| self.is_finite(i)) {
             return self;
         }
-        let stride = self.sh_stride();
         let mut kept = Self {
             sh_degree: self.sh_degree,
             ..Self::default()
         };
         for i in (0..self.len()).filter(|i| self.is_finite(*i)) {
-            kept.means.push(self.means[i]);
-            kept.log_scales.push(self.log_scales[i]);
-            kept.quats.push(self.quats[i]);
-            kept.opacity_logits.push(self.opacity_logits[i]);
-            kept.anchors.push(self.anchors[i]);
-            kept.sh
-                .extend_from_slice(&self.sh[i * stride..(i + 1) * stride]);
+            kept.push(&self, i);
         }
         kept
     }

@@ -106,8 +106,9 @@ fn map(frames: &[Frame], sets: &[&str]) -> Outcome {
         is_live: false,
         stop: Stop::default(),
         out: None,
+        outbox: None,
     };
-    let outcome = pipeline::run(job, None, &mut |_| ()).unwrap();
+    let outcome = pipeline::run(job, &mut |_| ()).unwrap();
     assert_eq!(outcome.error, None);
     outcome
 }

@@ -84,6 +84,7 @@ pub(crate) fn random_snapshot(
         scale: Scale::GIVEN,
         poses,
         splats: Arc::new(random_splats(n_splats, sh_degree, u64::from(revision))),
+        splat_ids: Arc::new((0..n_splats as u32).collect()),
     }
 }
 

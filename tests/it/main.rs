@@ -12,6 +12,7 @@ mod budgets;
 mod continued;
 mod crash;
 mod declared_lengths;
+mod deltas;
 mod engine;
 mod eval;
 mod eval_lines;
