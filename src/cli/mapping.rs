@@ -12,6 +12,7 @@ use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
 use crate::node::localise;
 use crate::node::pipeline;
+use crate::node::ros2;
 use crate::node::{Job, Outcome, Progress, Stop, linger, outbox, run_dir};
 use crate::source;
 
@@ -123,18 +124,25 @@ fn usage(error: &ConfigError) -> Usage {
 }
 
 fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<ExitCode> {
-    let params = settings.params().map_err(|e| usage(&e))?;
     let is_terminal = std::io::stderr().is_terminal();
     if let Some(out) = out {
         run_dir::prepare(out)?;
     }
     run_dir::start_log(out, is_terminal)?;
+    let mut settings = settings.clone();
+    let ros2 = ros2::join(&mut settings, input)?;
+    let settings = &settings;
+    let params = settings.params().map_err(|e| usage(&e))?;
     // A network that cannot be used is better known before the work than after it.
     let lpips = lpips::lpips(&params.eval.lpips_model)?;
     let source = source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
-    let outbox = outbox(&params)?;
+    let face = ros2.as_ref().map(ros2::Node::face).transpose()?;
+    let outbox = outbox(&params, face)?;
+    if let (Some(node), Some(outbox)) = (&ros2, &outbox) {
+        node.serve(outbox, &stop, params.ros2.autostart)?;
+    }
     let is_live = params.source.rate > 0.0;
     let job = Job {
         source,

@@ -9,6 +9,8 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::source::ros2::names::split_arguments;
+
 /// Camera frames in, refined poses and a 3D Gaussian splat map out.
 #[derive(Debug, Parser)]
 #[command(version, about, propagate_version = true)]
@@ -57,7 +59,7 @@ struct ParamArgs {
 
 #[derive(Debug, Args)]
 struct RunArgs {
-    /// mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
+    /// ros2:/TOPIC, mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
     #[arg(long, value_name = "URI")]
     source: String,
     /// Run directory to write at the end
@@ -212,8 +214,13 @@ struct ModelCheckArgs {
 
 /// Runs the program: exit 0 done, 1 failed with one line that says why, 2 usage.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let (arguments, ros_arguments) = split_arguments(std::env::args_os());
+    let cli = Cli::parse_from(arguments);
     let result = match cli.command {
+        _ if !ros_arguments.is_empty() && !cfg!(feature = "ros2") => Err(Usage(
+            "arguments behind --ros-args need a build with ROS 2; docs/ROS2.md says how".to_owned(),
+        )
+        .into()),
         Command::Run(args) => mapping::run(&args),
         Command::Replay(args) => mapping::replay(&args),
         Command::Localise(args) => mapping::localise(&args),

@@ -4,11 +4,14 @@
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
 pub mod align;
+pub mod describe;
 mod file;
 mod known;
+pub mod live;
 pub mod onnx;
 mod publish;
 mod range;
+pub mod ros2;
 pub mod scale;
 pub mod track;
 
@@ -21,9 +24,11 @@ use serde_json::Value;
 
 pub use self::known::KnownParams;
 pub use self::publish::{PublishParams, TfMode};
+pub use self::range::Range;
 use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
-use crate::config::range::{Range, ranges_of_comments};
+use crate::config::range::ranges_of_comments;
+use crate::config::ros2::Ros2Params;
 
 /// Named sets of values in `launch/presets`.
 const PRESETS: [(&str, &str); 1] = [("paper", include_str!("../../launch/presets/paper.yaml"))];
@@ -56,6 +61,10 @@ pub enum ConfigError {
         "parameters select.batch_overlap = {overlap} and select.batch_size = {size} do not fit: the overlap must be smaller"
     )]
     Overlap { overlap: usize, size: usize },
+    #[error(
+        "parameter {key} is read at the start only: set it in a parameter file, by --set or behind --ros-args, and start anew"
+    )]
+    Fixed { key: String },
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -66,6 +75,7 @@ pub struct Params {
     pub deterministic: bool,
     pub geometry: String,
     pub sequential: bool,
+    pub use_sim_time: bool,
     pub source: SourceParams,
     pub select: SelectParams,
     pub known: KnownParams,
@@ -78,6 +88,7 @@ pub struct Params {
     pub scale: scale::ScaleParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
+    pub ros2: Ros2Params,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -327,6 +338,10 @@ impl Settings {
         };
         self.values.insert(key.to_owned(), value);
         Ok(())
+    }
+
+    pub fn value(&self, key: &str) -> Option<&Value> {
+        self.values.get(key)
     }
 
     /// All keys with their values, for logs and reports.

@@ -6,6 +6,7 @@ pub mod autosave;
 pub mod localise;
 mod outward;
 pub mod pipeline;
+pub mod ros2;
 pub mod run_dir;
 mod stages;
 pub mod track_stage;
@@ -31,6 +32,7 @@ use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::node::outward::Clerk;
 use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
+use crate::publish::face::Face;
 use crate::publish::outbox::Outbox;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
@@ -229,13 +231,17 @@ fn spawn<T: Send + 'static>(
         .with_context(|| format!("cannot start thread {name}"))
 }
 
-/// The way out that the parameters ask for, if any.
-pub fn outbox(params: &Params) -> anyhow::Result<Option<Arc<Outbox>>> {
-    let is_wanted = params.publish.zenoh || !params.publish.record.is_empty();
-    let outbox = is_wanted
-        .then(|| Outbox::open(&params.publish))
-        .transpose()?;
-    Ok(outbox.map(Arc::new))
+/// The way out that the parameters ask for, if any, and over `face`.
+pub fn outbox(params: &Params, face: Option<Box<dyn Face>>) -> anyhow::Result<Option<Arc<Outbox>>> {
+    let (publish, has_face) = (&params.publish, face.is_some());
+    if !(publish.zenoh || has_face || !publish.record.is_empty()) {
+        return Ok(None);
+    }
+    let outbox = Outbox::open(publish)?;
+    Ok(Some(Arc::new(match face {
+        Some(face) => outbox.with_face(face),
+        None => outbox,
+    })))
 }
 
 /// Keeps the way out up for late joiners and services, then closes it; Ctrl-C cuts the wait short.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -17,12 +18,14 @@ use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
 use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
-use crate::source::{Source, SourceCounts};
+use crate::source::{Polled, Source, SourceCounts};
 
 /// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
+/// A source that waits for the world is asked so often whether to go on.
+const PATIENCE: Duration = Duration::from_millis(100);
 /// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
 const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 
@@ -31,6 +34,7 @@ pub(super) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
     outbox: Option<Arc<Outbox>>,
+    is_mounted: bool,
     pub(super) decode_secs: f64,
 }
 
@@ -76,27 +80,36 @@ impl SourceStage {
             source,
             stop,
             outbox,
+            is_mounted: false,
             decode_secs: 0.0,
         }
     }
 
     /// While paused, frames come and go.
     pub(super) fn next(&mut self) -> Option<Frame> {
-        loop {
-            if self.stop.is_asked() {
-                return None;
-            }
+        while !self.stop.is_asked() {
             let watch = Stopwatch::start();
-            let frame = self.source.next();
-            self.decode_secs += watch.secs();
+            let polled = self.source.poll(PATIENCE);
+            if !matches!(polled, Polled::Waiting) {
+                self.decode_secs += watch.secs();
+            }
             let Some(outbox) = self.outbox.as_ref() else {
-                return frame;
+                match polled {
+                    Polled::Frame(frame) => return Some(frame),
+                    Polled::Ended => return None,
+                    Polled::Waiting => continue,
+                }
             };
-            let Some(frame) = frame else {
-                outbox.note(|standing| standing.has_ended = true);
-                return None;
-            };
-            outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
+            let warnings = self.source.warnings();
+            outbox.note(|standing| standing.source_notes = warnings);
+            if let Polled::Frame(frame) = &polled {
+                if !self.is_mounted {
+                    let mount = self.source.mount();
+                    outbox.meet_camera(mount, self.source.camera_frame());
+                    self.is_mounted = mount.is_some();
+                }
+                outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
+            }
             let switches = outbox.switches();
             if switches.wants_reset.swap(false, Ordering::Relaxed) {
                 self.stop.ask_restart();
@@ -104,10 +117,16 @@ impl SourceStage {
             }
             let is_paused = switches.is_paused.load(Ordering::Relaxed);
             outbox.note(|standing| standing.is_paused = is_paused);
-            if !is_paused {
-                return Some(frame);
+            match polled {
+                Polled::Frame(frame) if !is_paused => return Some(frame),
+                Polled::Frame(_) | Polled::Waiting => {}
+                Polled::Ended => {
+                    outbox.note(|standing| standing.has_ended = true);
+                    return None;
+                }
             }
         }
+        None
     }
 
     pub(super) fn into_source(self) -> Box<dyn Source> {

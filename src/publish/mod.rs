@@ -17,6 +17,8 @@ pub mod live;
 pub mod outbox;
 pub mod overview;
 mod recording;
+#[cfg(feature = "ros2")]
+pub mod ros2;
 pub mod service;
 pub mod status;
 pub mod type_hash;
@@ -47,6 +49,9 @@ pub enum PublishError {
     Declare { key: String, reason: String },
     #[error("cannot send {key:?} over zenoh: {reason}")]
     Send { key: String, reason: String },
+    #[cfg(feature = "ros2")]
+    #[error("cannot send {topic:?} over ROS 2: {reason}")]
+    Ros2 { topic: &'static str, reason: String },
     #[error("cannot record what goes out: {reason}: {}", path.display())]
     Record { reason: String, path: PathBuf },
     #[error(transparent)]

@@ -79,6 +79,7 @@ pub struct Outbox {
     live_side: Mutex<LiveSide>,
     standing: Mutex<Standing>,
     since_picture: Mutex<Stopwatch>,
+    camera_frame: Mutex<String>,
 }
 
 impl std::fmt::Debug for Outbox {
@@ -142,6 +143,7 @@ impl Outbox {
             }),
             standing: Mutex::default(),
             since_picture: Mutex::new(Stopwatch::start()),
+            camera_frame: Mutex::new(params.camera_frame.clone()),
         })
     }
 
@@ -190,6 +192,16 @@ impl Outbox {
             standing.counts = counts;
             standing.is_calibrated = is_calibrated;
         });
+    }
+
+    /// What the input says of its camera: how it is mounted, where a parameter does not say, and its frame's name.
+    pub fn meet_camera(&self, base_from_cam: Option<Rigid>, frame: &str) {
+        if let Some(mount) = base_from_cam {
+            lock(&self.live_side).walker.mount_by_input(mount);
+        }
+        if !frame.is_empty() {
+            frame.clone_into(&mut lock(&self.camera_frame));
+        }
     }
 
     /// Sends to all faces; the first fault is returned once all have had it.
@@ -333,7 +345,8 @@ impl Outbox {
     /// Sends a keyframe's depth as costmaps take it.
     pub fn keyframe(&self, seen: &SeenKeyframe) -> Result<(), PublishError> {
         let metres = lock(&self.world).metres_per_unit.unwrap_or(1.0);
-        let cloud = overview::keyframe_cloud(seen, metres, &self.params);
+        let frame = lock(&self.camera_frame).clone();
+        let cloud = overview::keyframe_cloud(seen, metres, &frame);
         self.send(&Post::of(&KEYFRAME_CLOUD, seen.stamp, &cloud)?)
     }
 

@@ -100,7 +100,7 @@ pub fn cloud(
 }
 
 /// Verified depth of one keyframe in the camera's own frame: metres where they are known.
-pub fn keyframe_cloud(seen: &SeenKeyframe, metres: f64, params: &PublishParams) -> PointCloud2 {
+pub fn keyframe_cloud(seen: &SeenKeyframe, metres: f64, camera_frame: &str) -> PointCloud2 {
     let depth = &seen.depth;
     let (w, h) = (depth.width_px as usize, depth.height_px as usize);
     let known: Vec<usize> = (0..w * h)
@@ -121,7 +121,7 @@ pub fn keyframe_cloud(seen: &SeenKeyframe, metres: f64, params: &PublishParams) 
         let rgb = [0, 1, 2].map(|c| image.pixels[pixel + c]);
         (DVec3::new(x, y, z), rgb, depth.confidence[i])
     });
-    cloud_of(header(seen.stamp, &params.camera_frame), points)
+    cloud_of(header(seen.stamp, camera_frame), points)
 }
 
 fn cloud_of(header: Header, points: impl Iterator<Item = (DVec3, [u8; 3], f32)>) -> PointCloud2 {

@@ -114,6 +114,11 @@ impl Walker {
         }
     }
 
+    /// What the parameters say goes before it.
+    pub fn mount_by_input(&mut self, base_from_cam: Rigid) {
+        self.mount.get_or_insert(base_from_cam);
+    }
+
     /// `None` while nothing is known of the camera's place.
     pub fn walk(&mut self, live: &LiveFrame, world: &mut World) -> Option<Whereabouts> {
         let tracked = &live.tracked;

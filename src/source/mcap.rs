@@ -227,7 +227,7 @@ fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
     queue.iter().map(|waiting| waiting.payload.len()).sum()
 }
 
-fn picture_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
+pub(super) fn picture_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
     if is_compressed {
         let message: CompressedImage = ros::decode(payload).map_err(|e| e.to_string())?;
         return super::decode::compressed(&message.data).map_err(|e| e.to_string());
@@ -236,7 +236,7 @@ fn picture_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
     super::decode::raw(&message).map_err(|e| e.to_string())
 }
 
-fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
+pub(super) fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
     let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
     super::decode::depth(&message).map_err(|e| e.to_string())
 }

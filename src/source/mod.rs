@@ -8,6 +8,7 @@ pub mod images;
 pub mod intake;
 pub mod mcap;
 pub mod rectify;
+pub mod ros2;
 pub mod scene_formats;
 pub mod synthetic;
 
@@ -20,9 +21,11 @@ mod truth;
 use std::cmp::Ordering;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::config::SourceParams;
 use crate::frame::Frame;
+use crate::pose::Rigid;
 
 /// What a source met so far; copied into `report.json`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -32,6 +35,8 @@ pub struct SourceCounts {
     pub undecodable: u64,
     /// Stamps that did not increase; such frames are left out.
     pub out_of_order: u64,
+    /// Came faster than they were looked at; they count as received, too.
+    pub dropped: u64,
     /// The fault that ended the input early, for example a truncated recording. Frames before it stay in use.
     pub fault: Option<String>,
 }
@@ -46,7 +51,7 @@ pub enum SourceError {
         path: PathBuf,
     },
     #[error(
-        "{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder"
+        "{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE, ros2:/TOPIC or the path of a recording or folder"
     )]
     Uri { uri: String },
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
@@ -59,12 +64,44 @@ pub enum SourceError {
     },
     #[error("{uri:?} is not in this build; {way_out}")]
     NotInBuild { uri: String, way_out: &'static str },
+    #[cfg(feature = "ros2")]
+    #[error("cannot subscribe to {topic:?}: {reason}")]
+    Subscribe { topic: String, reason: String },
+}
+
+/// What a look for the next frame found.
+#[derive(Debug)]
+pub enum Polled {
+    Frame(Frame),
+    /// None yet; more may come.
+    Waiting,
+    Ended,
 }
 
 /// Hands out frames one at a time.
 pub trait Source: Send {
     /// The next frame; `None` at the end of the input. A fault in the middle ends the input and stands in `counts`.
     fn next(&mut self) -> Option<Frame>;
+
+    /// The next frame, if one comes within `patience`. Sources that wait for the world override it.
+    fn poll(&mut self, _patience: Duration) -> Polled {
+        self.next().map_or(Polled::Ended, Polled::Frame)
+    }
+
+    /// How the camera is mounted on the robot, `base_from_cam` in metres, where the input says so.
+    fn mount(&self) -> Option<Rigid> {
+        None
+    }
+
+    /// Name of the camera's frame, optical axes; empty where the input names none.
+    fn camera_frame(&self) -> &str {
+        ""
+    }
+
+    /// What keeps pictures from coming, a line each.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     fn counts(&self) -> SourceCounts;
 
@@ -90,7 +127,13 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("v4l2" | "webcam", _)) => not_in_build(
             "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
         ),
-        Some(("ros2" | "zenoh", _)) => not_in_build(
+        #[cfg(feature = "ros2")]
+        Some(("ros2", topic)) => Ok(Box::new(ros2::subscriber::Ros2Source::open(topic, params)?)),
+        #[cfg(not(feature = "ros2"))]
+        Some(("ros2", _)) => not_in_build(
+            "build where ROS 2 is sourced, with --features ros2 (docs/ROS2.md), or record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
+        ),
+        Some(("zenoh", _)) => not_in_build(
             "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
         ),
         _ => open_path(uri, params, seed),

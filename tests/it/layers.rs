@@ -119,6 +119,8 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("kornia_3d", &["src/geometry/"][..]),
         ("ort", &["src/onnx.rs"][..]),
         ("wgpu", &["src/gpu/"][..]),
+        ("r2r", &["src/source/ros2/", "src/publish/ros2/"][..]),
+        ("futures", &["src/source/ros2/"][..]),
         ("multiversion", &["src/splat/cpu/", "src/geometry/"][..]),
     ])
 }
