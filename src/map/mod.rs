@@ -240,9 +240,7 @@ impl SplatMap {
                 intrinsics: placed.intrinsics.refocused(focal_factor),
             })
             .collect();
-        // Stamps of a saved map are another recording's.
-        let first_own = poses.partition_point(|pose| pose.keyframe_id < self.first_id());
-        self.scale = self.measure_scale(&poses[first_own..]);
+        self.scale = self.measure_scale(self.own(&poses));
         self.revision += 1;
         let (splats, splat_ids) = self.finite_splats();
         Arc::new(Snapshot {

@@ -121,6 +121,12 @@ impl SplatMap {
         })
     }
 
+    /// Those of this run, of poses in order of id: stamps of a saved map are another recording's.
+    pub fn own<'a>(&self, poses: &'a [KeyframePose]) -> &'a [KeyframePose] {
+        let first_id = self.first_id();
+        &poses[poses.partition_point(|pose| pose.keyframe_id < first_id)..]
+    }
+
     /// As long as this run has no place in the saved map, that stays as it is.
     pub(super) fn waits_for_place(&self) -> bool {
         self.past.as_ref().is_some_and(|past| !past.is_joined)

@@ -7,7 +7,9 @@ use std::path::Path;
 use std::thread::JoinHandle;
 
 use crate::clock::Stopwatch;
+use crate::map::SplatMap;
 use crate::map::checkpoint::{self, Checkpoint};
+use crate::node::outward::Clerk;
 use crate::node::spawn;
 use crate::queue::{Sender, WhenFull, queue};
 
@@ -17,7 +19,7 @@ pub struct Autosave {
     every_secs: f64,
     since: Stopwatch,
     copies: Option<Sender<Box<Checkpoint>>>,
-    writer: Option<JoinHandle<u64>>,
+    writer: Option<JoinHandle<()>>,
 }
 
 impl Autosave {
@@ -29,15 +31,12 @@ impl Autosave {
         let path = out.join("map.splatmap");
         let (copies, taken) = queue::<Box<Checkpoint>>("autosave", 1, WhenFull::DropOldest);
         let writer = spawn("autosave", move || {
-            let mut n_written = 0;
             while let Some(checkpoint) = taken.recv() {
-                match checkpoint::write(&checkpoint, &path) {
-                    Ok(()) => n_written += 1,
-                    // The next one may find room; the run goes on.
-                    Err(e) => tracing::warn!("{e}"),
+                // The next one may find room; the run goes on.
+                if let Err(e) = checkpoint::write(&checkpoint, &path) {
+                    tracing::warn!("{e}");
                 }
             }
-            n_written
         })?;
         Ok(Some(Self {
             every_secs,
@@ -47,22 +46,26 @@ impl Autosave {
         }))
     }
 
-    pub fn is_due(&self) -> bool {
-        self.since.secs() >= self.every_secs
-    }
-
-    /// Takes a copy; one that still waits is given up for it.
-    pub fn save(&mut self, checkpoint: Checkpoint) {
+    /// Takes a copy where it is time for one; an older one that still waits is given up for it.
+    pub(super) fn save_if_due(&mut self, map: &mut SplatMap, clerk: &mut Clerk) {
+        if self.since.secs() < self.every_secs || map.n_splats() == 0 {
+            return;
+        }
         self.since = Stopwatch::start();
+        let snapshot = map.snapshot();
+        let copy = map.checkpoint(&snapshot, clerk.landmarks().to_vec());
         if let Some(copies) = &self.copies {
-            drop(copies.send(Box::new(checkpoint)));
+            drop(copies.send(Box::new(copy)));
         }
     }
+}
 
-    /// Waits for the file that is being written. Returns how many were.
-    pub fn finish(mut self) -> u64 {
+/// Waits for the file that is being written.
+impl Drop for Autosave {
+    fn drop(&mut self) {
         self.copies = None;
-        let writer = self.writer.take();
-        writer.and_then(|w| w.join().ok()).unwrap_or(0)
+        if let Some(Err(_)) = self.writer.take().map(JoinHandle::join) {
+            tracing::warn!("the thread of autosaves broke");
+        }
     }
 }

@@ -4,6 +4,7 @@
 
 pub mod autosave;
 pub mod localise;
+mod opening;
 mod outward;
 pub mod pipeline;
 pub mod ros2;
@@ -140,9 +141,7 @@ pub struct Outcome {
 impl Outcome {
     /// Keyframes of this run, without those of a saved map.
     pub fn own_poses(&self) -> &[KeyframePose] {
-        let poses = &self.snapshot.poses;
-        let first_id = self.map.first_id();
-        &poses[poses.partition_point(|pose| pose.keyframe_id < first_id)..]
+        self.map.own(&self.snapshot.poses)
     }
 }
 

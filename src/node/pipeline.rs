@@ -1,6 +1,5 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver as Calls;
 use std::time::Duration;
@@ -11,8 +10,7 @@ use crate::clock::Stopwatch;
 use crate::frame::{Batch, Frame};
 use crate::geometry::{GeometryBatch, GeometryError};
 use crate::map::snapshot::Snapshot;
-use crate::map::{SplatMap, checkpoint};
-use crate::node::autosave::Autosave;
+use crate::node::opening::{self, joined};
 use crate::node::outward::{self, run_live, run_publisher};
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
 use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
@@ -68,39 +66,12 @@ fn run_once(
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
-    let n_frames = job.source.len_hint().filter(|n| *n > 0);
-    let mut map = SplatMap::new(
-        job.params.map.clone(),
-        job.params.seed,
-        scale,
-        engine(job.params.backend, job.params.deterministic)?,
-    )
-    .measuring_scale(&job.params.scale)
-    .spilling_to(job.out.as_deref());
-    let mut track = TrackStage::new(&job.params.track, job.is_live);
-    if !job.params.map.load.is_empty() {
-        let saved = checkpoint::read(Path::new(&job.params.map.load))?;
-        track.begin_in(&saved.landmarks, &job.params.track)?;
-        map = map
-            .continued(saved, &job.params.track)
-            .map_err(|reason| anyhow!("cannot go on from {}: {reason}", job.params.map.load))?;
-    }
-    let first_id = map.first_id();
-    let outbox = job.outbox;
-    let mut map = MapStage::new(
+    let opening::Opened {
         map,
-        &job.params,
-        (job.is_live, n_frames),
-        job.stop.clone(),
-        outbox.clone(),
-    );
-    map.clerk.keep_calls(calls);
-    map.autosave = Autosave::start(job.out.as_deref(), job.params.map.autosave_secs)?;
-    if map.autosave.is_some() || outbox.is_some() {
-        let (told, landmarks) = queue("landmarks", 1, WhenFull::DropOldest);
-        track.tell_landmarks(job.params.map.autosave_secs, told);
-        map.clerk.hear_landmarks(landmarks);
-    }
+        track,
+        first_id,
+    } = opening::open(&job, scale, calls)?;
+    let outbox = job.outbox;
     let stages = Stages {
         map,
         select: SelectStage::new(&job.params, first_id),
@@ -435,12 +406,4 @@ fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
         // A tracker that is gone is no reason to stop mapping.
         drop(news.send(stage.map.keyframe_views()));
     }
-}
-
-fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
-    thread.join().map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));
-        anyhow!("stage {name} broke: {}", text.unwrap_or_default())
-    })
 }

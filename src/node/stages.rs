@@ -303,9 +303,7 @@ impl MapStage {
         }
         self.optimise_secs += watch.secs();
         // What the run directory gets at the end must not be overtaken by an older copy.
-        if let Some(autosave) = self.autosave.take() {
-            autosave.finish();
-        }
+        self.autosave = None;
         let snapshot = self.snapshot();
         self.note();
         let last = Progress {
@@ -370,18 +368,8 @@ impl MapStage {
             let snapshot = self.snapshot();
             publish(snapshot, self.progress());
         }
-        self.autosave_if_due();
-    }
-
-    fn autosave_if_due(&mut self) {
-        let is_due = self.autosave.as_ref().is_some_and(Autosave::is_due);
-        if is_due && self.map.n_splats() > 0 {
-            let snapshot = self.map.snapshot();
-            let landmarks = self.clerk.landmarks().to_vec();
-            let checkpoint = self.map.checkpoint(&snapshot, landmarks);
-            if let Some(autosave) = &mut self.autosave {
-                autosave.save(checkpoint);
-            }
+        if let Some(autosave) = &mut self.autosave {
+            autosave.save_if_due(&mut self.map, &mut self.clerk);
         }
     }
 
