@@ -10,6 +10,7 @@ pub mod pipeline;
 pub mod ros2;
 pub mod run_dir;
 mod stages;
+mod threads;
 pub mod track_stage;
 
 use std::path::{Path, PathBuf};

@@ -57,11 +57,3 @@ pub(super) fn open(job: &Job, scale: Scale, calls: Option<Calls<Call>>) -> anyho
         first_id,
     })
 }
-
-pub(super) fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
-    thread.join().map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));
-        anyhow!("stage {name} broke: {}", text.unwrap_or_default())
-    })
-}

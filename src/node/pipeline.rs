@@ -4,17 +4,16 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver as Calls;
 use std::time::Duration;
 
-use anyhow::anyhow;
-
 use crate::clock::Stopwatch;
-use crate::frame::{Batch, Frame};
-use crate::geometry::{GeometryBatch, GeometryError};
+use crate::frame::Batch;
+use crate::geometry::GeometryError;
 use crate::map::snapshot::Snapshot;
-use crate::node::opening::{self, joined};
+use crate::node::opening;
 use crate::node::outward::{self, run_live, run_publisher};
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
-use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
-use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
+use crate::node::threads::{Answer, joined, run_geometry, run_select, run_source};
+use crate::node::track_stage::{News, TrackStage, Tracking, policies, run_track};
+use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::publish::outbox::Outbox;
 use crate::publish::service::Call;
 use crate::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
@@ -29,9 +28,6 @@ const EVENT_QUEUE: usize = 8;
 const CALL_TICK: Duration = Duration::from_millis(100);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
 const NEWS_SECS: f64 = 1.0;
-
-/// What crosses from geometry to the map; no batch at the model's end.
-type Answer = (Option<Arc<Batch>>, GeometryBatch);
 
 /// Runs a job to its end; a reset on the way throws the map away and goes on with the same source. `on_progress` is
 /// called on this thread.
@@ -286,72 +282,6 @@ impl End {
             error: self.error.or(fault),
             outbox,
         }
-    }
-}
-
-fn run_source(
-    mut stage: SourceStage,
-    frames: &Sender<Frame>,
-    heard: Option<&Sender<Heard>>,
-) -> (SourceStage, u64) {
-    while let Some(frame) = stage.next() {
-        tell(heard, &frame);
-        if frames.send(frame).is_err() {
-            break;
-        }
-    }
-    (stage, frames.dropped())
-}
-
-fn run_select(
-    mut stage: SelectStage,
-    frames: &Receiver<Frame>,
-    batches: &Sender<Arc<Batch>>,
-    heard: Option<&Sender<Heard>>,
-) -> SelectStage {
-    // The tracker hears of a batch before geometry does: news of a batch can always be taken, so that nobody waits in
-    // a circle.
-    let send = |batch: Batch| {
-        if let Some(heard) = heard {
-            drop(heard.send(Heard::Batch));
-        }
-        batches.send(Arc::new(batch)).is_ok()
-    };
-    while let Some(frame) = frames.recv() {
-        tell(heard, &frame);
-        if let Some(batch) = stage.push(frame)
-            && !send(batch)
-        {
-            return stage;
-        }
-    }
-    if let Some(batch) = stage.finish() {
-        send(batch);
-    }
-    stage
-}
-
-fn run_geometry(
-    mut stage: GeometryStage,
-    batches: &Receiver<Arc<Batch>>,
-    answers: &Sender<Answer>,
-) -> (GeometryStage, Option<GeometryError>) {
-    while let Some(batch) = batches.recv() {
-        match stage.infer(&batch) {
-            Ok(geometry) => {
-                if answers.send((Some(batch), geometry)).is_err() {
-                    return (stage, None);
-                }
-            }
-            Err(error) => return (stage, Some(error)),
-        }
-    }
-    match stage.finish() {
-        Ok(geometry) => {
-            drop(answers.send((None, geometry)));
-            (stage, None)
-        }
-        Err(error) => (stage, Some(error)),
     }
 }
 

@@ -302,7 +302,7 @@ impl MapStage {
             self.map.refine_held_out();
         }
         self.optimise_secs += watch.secs();
-        // What the run directory gets at the end must not be overtaken by an older copy.
+        // The last map file must not be overtaken by an older one.
         self.autosave = None;
         let snapshot = self.snapshot();
         self.note();
