@@ -47,14 +47,15 @@ impl Autosave {
     }
 
     /// Takes a copy where it is time for one; an older one that still waits is given up for it.
-    pub(super) fn save_if_due(&mut self, map: &mut SplatMap, clerk: &mut Clerk) {
-        if self.since.secs() < self.every_secs || map.n_splats() == 0 {
+    pub(super) fn save_if_due(this: Option<&mut Self>, map: &mut SplatMap, clerk: &mut Clerk) {
+        let is_due = |this: &&mut Self| this.since.secs() >= this.every_secs;
+        let Some(this) = this.filter(is_due).filter(|_| map.n_splats() > 0) else {
             return;
-        }
-        self.since = Stopwatch::start();
+        };
+        this.since = Stopwatch::start();
         let snapshot = map.snapshot();
         let copy = map.checkpoint(&snapshot, clerk.landmarks().to_vec());
-        if let Some(copies) = &self.copies {
+        if let Some(copies) = &this.copies {
             drop(copies.send(Box::new(copy)));
         }
     }

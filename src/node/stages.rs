@@ -368,9 +368,7 @@ impl MapStage {
             let snapshot = self.snapshot();
             publish(snapshot, self.progress());
         }
-        if let Some(autosave) = &mut self.autosave {
-            autosave.save_if_due(&mut self.map, &mut self.clerk);
-        }
+        Autosave::save_if_due(self.autosave.as_mut(), &mut self.map, &mut self.clerk);
     }
 
     fn snapshot(&mut self) -> Arc<Snapshot> {
