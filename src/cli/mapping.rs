@@ -23,7 +23,21 @@ pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
             .set("source.rate", 1.0.into())
             .map_err(|e| usage(&e))?;
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.source, args.out.as_deref())
+}
+
+/// `--map` is `map.load`.
+fn load(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
+    if let Some(map) = map {
+        let path = map
+            .to_str()
+            .ok_or_else(|| Usage(format!("--map {} is no text", map.display())))?;
+        settings
+            .set("map.load", path.into())
+            .map_err(|e| usage(&e))?;
+    }
+    Ok(())
 }
 
 pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
@@ -55,6 +69,7 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
             settings.set(key, value).map_err(|e| usage(&e))?;
         }
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.input, args.out.as_deref())
 }
 
@@ -134,6 +149,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         params: params.clone(),
         is_live,
         stop: stop.clone(),
+        out: out.map(Path::to_owned),
         outbox,
     };
     let bar = bar(is_terminal);
@@ -155,6 +171,14 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
         anyhow::bail!(
             "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
             outcome.snapshot.poses.len()
+        );
+    }
+    if let Some(continued) = outcome.map.continuation().filter(|c| !c.is_joined) {
+        anyhow::bail!(
+            "the recording has no place in the map: {} of {} keyframes were found among the {} of the map, 3 or more must agree; the saved map is as it was, and the recording must see what it was made of, in similar light: {input}",
+            continued.found,
+            continued.asked,
+            continued.keyframes
         );
     }
     if outcome.snapshot.poses.is_empty() {

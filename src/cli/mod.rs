@@ -65,6 +65,9 @@ struct RunArgs {
     /// Run directory to write at the end
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -77,6 +80,9 @@ struct ReplayArgs {
     /// Run directory to write
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// Multiple of the recorded speed, or max; with a number late frames are dropped and counted
     #[arg(long, value_name = "R|max")]
     rate: Option<String>,

@@ -9,7 +9,6 @@ use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::export::ply;
 use crate::map::SplatMap;
-use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::snapshot::Snapshot;
 use crate::publish::PublishError;
 use crate::publish::outbox::Outbox;
@@ -113,16 +112,31 @@ fn publish(outbox: &Outbox, (snapshot, is_last): &Outgoing) -> Result<(), Publis
 pub(super) struct Clerk {
     calls: Option<Calls<Call>>,
     track: TrackParams,
-    seed: u64,
+    /// What the tracker tells of its landmarks now and then, and the newest of it.
+    told: Option<Receiver<Vec<u8>>>,
+    landmarks: Vec<u8>,
 }
 
 impl Clerk {
-    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams, seed: u64) -> Self {
+    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams) -> Self {
         Self {
             calls,
             track: track.clone(),
-            seed,
+            told: None,
+            landmarks: Vec::new(),
         }
+    }
+
+    pub(super) fn hear_landmarks(&mut self, told: Receiver<Vec<u8>>) {
+        self.told = Some(told);
+    }
+
+    /// The newest that the tracker has told; empty before.
+    pub(super) fn landmarks(&mut self) -> &[u8] {
+        while let Some(Ok(Some(newest))) = self.told.as_ref().map(Receiver::try_recv) {
+            self.landmarks = newest;
+        }
+        &self.landmarks
     }
 
     /// Those of the map before, where there are any.
@@ -136,7 +150,7 @@ impl Clerk {
     }
 
     /// Answers what has been asked since.
-    pub(super) fn serve(&self, map: &mut SplatMap) {
+    pub(super) fn serve(&mut self, map: &mut SplatMap) {
         while let Some(call) = self.calls.as_ref().and_then(|calls| calls.try_recv().ok()) {
             let answer = self.answer(map, &call.request);
             if let Answer::Refused(reason) = &answer {
@@ -146,7 +160,7 @@ impl Clerk {
         }
     }
 
-    fn answer(&self, map: &mut SplatMap, request: &Request) -> Answer {
+    fn answer(&mut self, map: &mut SplatMap, request: &Request) -> Answer {
         let done = |what: &str, written: Result<(), String>| match written {
             Ok(()) => Answer::Done(what.to_owned()),
             Err(reason) => Answer::Refused(reason),
@@ -175,15 +189,17 @@ impl Clerk {
     }
 
     /// With landmarks, so that a later run finds its place.
-    fn save(&self, map: &mut SplatMap, path: &Path) -> Result<(), String> {
-        let mut tracker = Tracker::new(&self.track);
-        tracker.update(&map.keyframe_views());
-        let saved = Checkpoint {
-            snapshot: (*map.snapshot()).clone(),
-            seed: self.seed,
-            steps: map.n_steps(),
-            landmarks: tracker.saved()?,
-        };
-        checkpoint::write(&saved, path).map_err(|e| e.to_string())
+    fn save(&mut self, map: &mut SplatMap, path: &Path) -> Result<(), String> {
+        let mut landmarks = Vec::new();
+        if map.has_all_pictures() {
+            let mut tracker = Tracker::new(&self.track);
+            tracker.update(&map.keyframe_views());
+            landmarks = tracker.saved()?;
+        }
+        // Keyframes of a saved map, and those on disk, only the tracker remembers.
+        if landmarks.is_empty() {
+            landmarks = self.landmarks().to_vec();
+        }
+        map.save(landmarks, path).map_err(|e| e.to_string())
     }
 }

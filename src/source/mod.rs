@@ -158,6 +158,9 @@ fn open_synthetic(
     params: &SourceParams,
     seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
+    if scene.split('?').next() == Some("endless") {
+        return Ok(Box::new(synthetic::endless::EndlessSource::open(scene)?));
+    }
     Ok(Box::new(synthetic::SyntheticSource::open(
         scene, params, seed,
     )?))

@@ -8,6 +8,9 @@
 mod alignment;
 mod backends;
 mod bags;
+mod budgets;
+mod continued;
+mod crash;
 mod declared_lengths;
 mod deltas;
 mod engine;
