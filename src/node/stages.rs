@@ -95,7 +95,7 @@ impl SourceStage {
             }
             let Some(outbox) = self.outbox.as_ref() else {
                 match polled {
-                    Polled::Frame(frame) => return Some(frame),
+                    Polled::Frame(frame) => return Some(*frame),
                     Polled::Ended => return None,
                     Polled::Waiting => continue,
                 }
@@ -118,7 +118,7 @@ impl SourceStage {
             let is_paused = switches.is_paused.load(Ordering::Relaxed);
             outbox.note(|standing| standing.is_paused = is_paused);
             match polled {
-                Polled::Frame(frame) if !is_paused => return Some(frame),
+                Polled::Frame(frame) if !is_paused => return Some(*frame),
                 Polled::Frame(_) | Polled::Waiting => {}
                 Polled::Ended => {
                     outbox.note(|standing| standing.has_ended = true);

@@ -72,7 +72,7 @@ pub enum SourceError {
 /// What a look for the next frame found.
 #[derive(Debug)]
 pub enum Polled {
-    Frame(Frame),
+    Frame(Box<Frame>),
     /// None yet; more may come.
     Waiting,
     Ended,
@@ -85,7 +85,8 @@ pub trait Source: Send {
 
     /// The next frame, if one comes within `patience`. Sources that wait for the world override it.
     fn poll(&mut self, _patience: Duration) -> Polled {
-        self.next().map_or(Polled::Ended, Polled::Frame)
+        self.next()
+            .map_or(Polled::Ended, |frame| Polled::Frame(Box::new(frame)))
     }
 
     /// How the camera is mounted on the robot, `base_from_cam` in metres, where the input says so.

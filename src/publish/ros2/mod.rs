@@ -124,3 +124,42 @@ fn qos(delivery: Delivery) -> QosProfile {
         Delivery::Newest => reliable.keep_last(NEWEST_DEPTH),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::{Path, PathBuf};
+
+    use super::*;
+    use crate::publish::outbox::TOPICS;
+    use crate::publish::service::SERVICES;
+    use crate::publish::type_hash::{hash_of, service_hash};
+
+    /// What rosidl computed when the interface package was built.
+    fn rosidl_hash(type_name: &str) -> String {
+        let (package, rest) = type_name.split_once('/').unwrap();
+        let prefixes = std::env::var("AMENT_PREFIX_PATH").expect("a sourced ROS 2");
+        let file = |prefix: &str| {
+            let share = Path::new(prefix).join("share").join(package);
+            Some(share.join(format!("{rest}.json"))).filter(|file| file.is_file())
+        };
+        let file: PathBuf = prefixes.split(':').find_map(file).expect(type_name);
+        let json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap();
+        let hashes = json["type_hashes"].as_array().unwrap();
+        let own = hashes.iter().find(|hash| hash["type_name"] == type_name);
+        own.unwrap()["hash_string"].as_str().unwrap().to_owned()
+    }
+
+    #[test]
+    fn type_hashes_of_all_topics_and_services_are_those_of_rosidl() {
+        for topic in TOPICS {
+            let own = hash_of(topic.type_name, topic.definition);
+            assert_eq!(own, rosidl_hash(topic.type_name), "{}", topic.type_name);
+        }
+        for service in &SERVICES {
+            let (question, answer) = (service.request_definition, service.response_definition);
+            let own = service_hash(service.type_name, question, answer);
+            assert_eq!(own, rosidl_hash(service.type_name), "{}", service.type_name);
+        }
+    }
+}

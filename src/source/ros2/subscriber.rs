@@ -23,6 +23,8 @@ use crate::source::{Polled, Source, SourceCounts, SourceError};
 
 /// Stamps that lie so far back are not a matter of order but of another time.
 const JUMP_SECS: f64 = 1.0;
+/// Without any transform for so long after the first picture, there is no odometry to wait for.
+const SETTLE_SECS: f64 = 0.5;
 /// How often what a picture waits for is looked at.
 const TICK: Duration = Duration::from_millis(2);
 
@@ -35,6 +37,8 @@ pub struct Ros2Source {
     beside: Beside,
     /// Made with the first frame, when the lens is known or given up.
     intake: Option<Intake>,
+    /// Before there is an intake.
+    n_unreadable: u64,
     camera_frame: String,
     uses_transforms: bool,
     waiting: Option<Picture>,
@@ -77,6 +81,7 @@ impl Ros2Source {
             topic: topic.to_owned(),
             subscription: None,
             intake: None,
+            n_unreadable: 0,
             camera_frame: String::new(),
             uses_transforms: false,
             waiting: None,
@@ -132,9 +137,10 @@ impl Ros2Source {
         if self.intake.is_none() {
             self.camera_frame = header_frame(&picture.payload).unwrap_or_default();
             let has_lens = self.beside.lens(&self.topic).is_some();
+            let is_settled = waited > SETTLE_SECS && !self.beside.has_moving_transforms();
             let has_odometry = self.beside.reaches_odometry(&self.camera_frame)
                 || self.beside.has_odometry_topic
-                || !self.beside.has_moving_transforms();
+                || is_settled;
             let is_late = waited > self.link.live.number("ros2.calibration_secs");
             if !(has_lens && has_odometry || is_late) {
                 return None;
@@ -182,9 +188,10 @@ impl Ros2Source {
 
     fn frame_of(&mut self, picture: &Picture, companions: Companions) -> Option<Frame> {
         let is_compressed = self.subscription.as_ref()?.is_compressed;
-        let intake = self
-            .intake
-            .get_or_insert_with(|| Intake::new(&self.params, None));
+        let Some(intake) = &mut self.intake else {
+            self.n_unreadable += 1;
+            return None;
+        };
         let Some(stamp) = picture.stamp else {
             intake.unreadable("its message has no CDR header");
             return None;
@@ -300,7 +307,7 @@ impl Source for Ros2Source {
     fn next(&mut self) -> Option<Frame> {
         loop {
             match self.poll(Duration::from_secs(1)) {
-                Polled::Frame(frame) => return Some(frame),
+                Polled::Frame(frame) => return Some(*frame),
                 Polled::Waiting => {}
                 Polled::Ended => return None,
             }
@@ -334,7 +341,7 @@ impl Source for Ros2Source {
                 if self.watch.is_due() {
                     self.look_for_silence();
                 }
-                return Polled::Frame(frame);
+                return Polled::Frame(Box::new(frame));
             }
         }
     }
@@ -358,7 +365,8 @@ impl Source for Ros2Source {
             .subscription
             .as_ref()
             .map_or(0, |s| s.pictures.dropped());
-        counts.received += dropped;
+        counts.received += dropped + self.n_unreadable;
+        counts.undecodable += self.n_unreadable;
         counts.dropped += dropped;
         counts
     }
