@@ -2,6 +2,9 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::Duration;
+
+use crate::clock::Stopwatch;
 
 /// What `send` does when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -134,6 +137,28 @@ impl<T> Receiver<T> {
                 .changed
                 .wait(state)
                 .unwrap_or_else(std::sync::PoisonError::into_inner);
+        }
+    }
+
+    /// Waits so long for an item: `Ok(None)` when none came, `Err(Ended)` when no more will come.
+    pub fn recv_within(&self, wait: Duration) -> Result<Option<T>, Ended> {
+        let watch = Stopwatch::start();
+        let mut state = self.shared.lock();
+        loop {
+            if let Some(item) = state.items.pop_front() {
+                drop(state);
+                self.shared.changed.notify_all();
+                return Ok(Some(item));
+            }
+            let left = wait.saturating_sub(watch.elapsed());
+            if !state.sender_is_alive {
+                return Err(Ended);
+            }
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let waited = self.shared.changed.wait_timeout(state, left);
+            state = waited.unwrap_or_else(std::sync::PoisonError::into_inner).0;
         }
     }
 

@@ -150,17 +150,18 @@ impl Report {
 }
 
 impl FrameCounts {
-    /// `dropped` comes from the first queue, the rest from the source.
+    /// `dropped` comes from the first queue, to which those are added that never came that far.
     pub fn of(counts: &SourceCounts, dropped: u64) -> Self {
         let SourceCounts {
             received,
             undecodable,
             out_of_order,
+            dropped: missed,
             ..
         } = *counts;
         Self {
             received,
-            dropped,
+            dropped: dropped + missed,
             undecodable,
             out_of_order,
         }

@@ -63,6 +63,11 @@ impl Stop {
         self.is_asked.store(true, Ordering::Relaxed);
     }
 
+    /// For sources, which know no nodes.
+    pub fn flag(&self) -> &Arc<AtomicBool> {
+        &self.is_asked
+    }
+
     pub fn is_asked(&self) -> bool {
         self.is_asked.load(Ordering::Relaxed)
     }

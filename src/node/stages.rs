@@ -63,7 +63,8 @@ pub(super) struct MapStage {
 }
 
 impl SourceStage {
-    pub(super) fn new(source: Box<dyn Source>, stop: Stop) -> Self {
+    pub(super) fn new(mut source: Box<dyn Source>, stop: Stop) -> Self {
+        source.end_when(stop.flag());
         Self {
             source,
             stop,
