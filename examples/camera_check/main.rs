@@ -15,7 +15,11 @@ fn main() -> std::process::ExitCode {
     use std::path::PathBuf;
     use std::process::ExitCode;
 
-    tracing_subscriber::fmt().without_time().init();
+    tracing_subscriber::fmt()
+        .without_time()
+        .with_target(false)
+        .with_ansi(false)
+        .init();
     let device = std::env::args().nth(1).filter(|arg| !arg.is_empty());
     let is_vivid = device.is_none();
     let device = PathBuf::from(device.unwrap_or_else(|| "/dev/video0".to_owned()));

@@ -89,9 +89,20 @@ struct Written {
     n_files: AtomicU64,
 }
 
-enum Input {
+/// What is recorded.
+pub enum Input {
+    /// As it comes, with its calibration.
     Camera(Box<Live>, Option<CameraInfo>),
     Frames(Box<dyn Source>),
+}
+
+impl std::fmt::Debug for Input {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Camera(live, _) => write!(f, "Camera({live:?})"),
+            Self::Frames(_) => write!(f, "Frames"),
+        }
+    }
 }
 
 /// Records until the end of the source, of the duration, or until asked.
@@ -103,6 +114,17 @@ pub fn record(
     on_progress: &mut dyn FnMut(&Progress),
 ) -> Result<Progress, RecordError> {
     let input = open(wanted, source, asked)?;
+    record_from(input, wanted, params, asked, on_progress)
+}
+
+/// The same from an input that is open.
+pub fn record_from(
+    input: Input,
+    wanted: &Wanted,
+    params: &RecordParams,
+    asked: &Arc<AtomicBool>,
+    on_progress: &mut dyn FnMut(&Progress),
+) -> Result<Progress, RecordError> {
     let written = Arc::new(Written::default());
     let files = Files::create(&wanted.out, params, &written)?;
     let when_full = match &input {
@@ -126,11 +148,7 @@ pub fn record(
         progress.n_files = written.n_files.load(Ordering::Relaxed);
         if shown.secs() > WORD_SECS {
             shown = Stopwatch::start();
-            let with_late = Progress {
-                n_dropped: progress.n_dropped + pictures.dropped(),
-                ..*progress
-            };
-            on_progress(&with_late);
+            on_progress(&without_late(*progress, pictures.dropped()));
         }
     };
     match input {
@@ -143,7 +161,7 @@ pub fn record(
             from_frames(source, until, &pictures, &mut progress, &mut tell);
         }
     }
-    progress.n_dropped += pictures.dropped();
+    let mut progress = without_late(progress, pictures.dropped());
     drop(pictures);
     let done = writer.join().unwrap_or_else(|_| {
         Err(RecordError::Write {
@@ -155,6 +173,15 @@ pub fn record(
     progress.n_bytes = written.n_bytes.load(Ordering::Relaxed);
     progress.n_files = written.n_files.load(Ordering::Relaxed);
     done.map(|()| progress)
+}
+
+/// Pictures that the disk was too slow for are dropped ones.
+fn without_late(progress: Progress, n_late: u64) -> Progress {
+    Progress {
+        n_pictures: progress.n_pictures - n_late,
+        n_dropped: progress.n_dropped + n_late,
+        ..progress
+    }
 }
 
 fn open(

@@ -8,6 +8,8 @@
 mod alignment;
 mod backends;
 mod bags;
+mod camera_script;
+mod cameras;
 mod declared_lengths;
 mod engine;
 mod eval;
@@ -42,6 +44,7 @@ mod opening;
 mod over_zenoh;
 mod pictures;
 mod publish;
+mod recordings;
 mod reference;
 mod refiner;
 mod render;

@@ -6,7 +6,7 @@ const NONE_FIX: &str = "plug a camera in; in a container, pass it on with --devi
 
 #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
 pub(super) fn cameras() -> Check {
-    check_of(crate::source::v4l2::list())
+    check_of(crate::source::v4l2::list::list())
 }
 
 #[cfg(not(all(feature = "camera-v4l", target_os = "linux")))]
@@ -29,7 +29,7 @@ mod found {
     use super::NONE_FIX;
     use crate::source::camera::CameraError;
     use crate::source::camera::modes::{Offer, hz};
-    use crate::source::v4l2::Found;
+    use crate::source::v4l2::list::Found;
 
     type Listed = (PathBuf, Result<Found, CameraError>);
 

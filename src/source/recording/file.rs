@@ -209,6 +209,7 @@ impl Part {
         let is_large = self.chunk_bytes >= params.chunk_kib << 10;
         if is_large || self.since_chunk.secs() >= params.chunk_secs {
             bag.flush()?;
+            tracing::debug!("{} messages are on disk", bag.n_messages);
             self.chunk_bytes = 0;
             self.since_chunk = Stopwatch::start();
         }
