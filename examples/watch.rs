@@ -9,10 +9,10 @@ use std::time::Duration;
 use anyhow::{Result, anyhow, bail};
 use clap::Parser;
 use splat_mapper::clock::Stopwatch;
-use splat_mapper::publish::assemble::Assembler;
+use splat_mapper::publish::follow::{Followed, Follower};
 use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::ros::{self, PoseStamped};
-use splat_mapper::{clock::Stamp, export::ply, map::layout, map::snapshot::Snapshot};
+use splat_mapper::ros::{self, standard::PoseWithCovarianceStamped};
+use splat_mapper::{clock::Stamp, export::ply, map::layout};
 use zenoh::qos::CongestionControl;
 use zenoh::query::ConsolidationMode;
 use zenoh::sample::Sample;
@@ -43,27 +43,30 @@ struct Args {
 const MAX_MAP_BYTES: usize = 4 << 30;
 
 struct Watch {
-    assembler: Assembler,
+    follower: Follower,
     /// The publisher that the pieces come from; a restarted one counts its revisions from the start again.
     gid: Vec<u8>,
 }
 
 impl Watch {
-    fn take(&mut self, sample: &Sample) -> Option<Snapshot> {
+    fn take(&mut self, sample: &Sample) -> Followed {
         let payload = sample.payload().to_bytes();
         // domain / namespace / topic / type / hash
-        let dds_type = sample.key_expr().as_str().rsplit('/').nth(1)?;
-        if dds_type == dds_type_name::<PoseStamped>() {
-            let Ok(pose) = ros::decode::<PoseStamped>(&payload) else {
-                return None;
+        let dds_type = sample.key_expr().as_str().rsplit('/').nth(1);
+        let Some(dds_type) = dds_type else {
+            return Followed::Nothing;
+        };
+        if dds_type == dds_type_name::<PoseWithCovarianceStamped>() {
+            let Ok(pose) = ros::decode::<PoseWithCovarianceStamped>(&payload) else {
+                return Followed::Nothing;
             };
-            let (p, q) = (pose.pose.position, pose.pose.orientation);
+            let (p, q) = (pose.pose.pose.position, pose.pose.pose.orientation);
             let stamp = Stamp::from(pose.header.stamp);
             println!(
                 "pose {stamp} {:.4} {:.4} {:.4}  {:.5} {:.5} {:.5} {:.5}",
                 p.x, p.y, p.z, q.x, q.y, q.z, q.w
             );
-            return None;
+            return Followed::Nothing;
         }
         let attachment = sample
             .attachment()
@@ -72,9 +75,9 @@ impl Watch {
         let gid = attachment.get(17..).unwrap_or_default();
         if dds_type.contains("SplatManifest") && gid != self.gid {
             self.gid = gid.to_vec();
-            self.assembler = Assembler::new(MAX_MAP_BYTES);
+            self.follower = Follower::new(MAX_MAP_BYTES);
         }
-        self.assembler.add_payload(dds_type, &payload)
+        self.follower.add_payload(dds_type, &payload)
     }
 }
 
@@ -105,7 +108,7 @@ fn main() -> Result<()> {
         .map_err(|e| anyhow!("{key}: {e}"))?;
 
     let mut watch = Watch {
-        assembler: Assembler::new(MAX_MAP_BYTES),
+        follower: Follower::new(MAX_MAP_BYTES),
         gid: Vec::new(),
     };
     let mut has_snapshot = false;
@@ -129,18 +132,25 @@ fn main() -> Result<()> {
             .recv_timeout(Duration::from_millis(500))
             .map_err(|e| anyhow!("zenoh ended: {e}"))?;
         samples.extend(one);
-        let snapshots: Vec<Snapshot> = samples
-            .iter()
-            .filter_map(|sample| watch.take(sample))
-            .collect();
-        for snapshot in snapshots {
-            let (map, sha) = (&snapshot.splats, layout::map_sha256(&snapshot.splats));
+        for sample in &samples {
+            match watch.take(sample) {
+                Followed::Nothing => continue,
+                Followed::Missed => {
+                    has_snapshot = false;
+                    continue;
+                }
+                Followed::Advanced => {}
+            }
+            let Some(held) = watch.follower.held() else {
+                continue;
+            };
+            let (map, sha) = (&held.splats, layout::map_sha256(&held.splats));
             println!(
                 "revision {} epoch {}: {} splats, {} keyframes, sha256 {sha}",
-                snapshot.revision,
-                snapshot.epoch,
+                held.revision,
+                held.epoch,
                 map.len(),
-                snapshot.poses.len()
+                held.poses.len()
             );
             if let Some(path) = &args.out {
                 ply::write(map, path)?;

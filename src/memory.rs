@@ -28,7 +28,18 @@ pub fn free_gpu_mib() -> Option<f64> {
 
 /// The most memory this process ever had, where the system tells (Linux).
 pub fn peak_rss_mib() -> Option<f64> {
-    peak_of_status(&std::fs::read_to_string("/proc/self/status").ok()?)
+    mib_of_status(
+        &std::fs::read_to_string("/proc/self/status").ok()?,
+        "VmHWM:",
+    )
+}
+
+/// The memory that this process has now, where the system tells (Linux).
+pub fn rss_mib() -> Option<f64> {
+    mib_of_status(
+        &std::fs::read_to_string("/proc/self/status").ok()?,
+        "VmRSS:",
+    )
 }
 
 /// What `peak_rss_mib` says counts from here. Returns whether the system allows it.
@@ -50,10 +61,8 @@ fn free_of(meminfo: &str, cgroup_max: &str, cgroup_used: &str) -> Option<f64> {
     Some(in_container_kib.map_or(available_kib, |limit| limit.min(available_kib)) / 1024.0)
 }
 
-fn peak_of_status(status: &str) -> Option<f64> {
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("VmHWM:"))?;
+fn mib_of_status(status: &str, name: &str) -> Option<f64> {
+    let line = status.lines().find_map(|line| line.strip_prefix(name))?;
     let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
     Some(kib / 1024.0)
 }
@@ -75,10 +84,10 @@ mod tests {
     #[test]
     fn peak_memory_is_read_from_the_status_file() {
         assert_eq!(
-            peak_of_status("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 1 kB\n"),
+            mib_of_status("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 1 kB\n", "VmHWM:"),
             Some(2.0)
         );
-        assert_eq!(peak_of_status("Name:\tx\n"), None);
-        assert_eq!(peak_of_status("VmHWM:\t many kB\n"), None);
+        assert_eq!(mib_of_status("Name:\tx\n", "VmHWM:"), None);
+        assert_eq!(mib_of_status("VmHWM:\t many kB\n", "VmHWM:"), None);
     }
 }

@@ -4,8 +4,6 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::Duration;
 
-use crate::clock::Stopwatch;
-
 /// What `send` does when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WhenFull {
@@ -140,28 +138,6 @@ impl<T> Receiver<T> {
         }
     }
 
-    /// Waits so long for an item: `Ok(None)` when none came, `Err(Ended)` when no more will come.
-    pub fn recv_within(&self, wait: Duration) -> Result<Option<T>, Ended> {
-        let watch = Stopwatch::start();
-        let mut state = self.shared.lock();
-        loop {
-            if let Some(item) = state.items.pop_front() {
-                drop(state);
-                self.shared.changed.notify_all();
-                return Ok(Some(item));
-            }
-            let left = wait.saturating_sub(watch.elapsed());
-            if !state.sender_is_alive {
-                return Err(Ended);
-            }
-            if left.is_zero() {
-                return Ok(None);
-            }
-            let waited = self.shared.changed.wait_timeout(state, left);
-            state = waited.unwrap_or_else(std::sync::PoisonError::into_inner).0;
-        }
-    }
-
     /// An item if one is there: `Ok(None)` when empty, `Err(Ended)` when no more will come.
     pub fn try_recv(&self) -> Result<Option<T>, Ended> {
         let mut state = self.shared.lock();
@@ -177,6 +153,36 @@ impl<T> Receiver<T> {
         }
     }
 
+    /// Waits for an item, but no longer than `timeout`.
+    pub fn recv_timeout(&self, timeout: Duration) -> Received<T> {
+        let state = self.shared.lock();
+        let is_quiet = |state: &mut State<T>| state.items.is_empty() && state.sender_is_alive;
+        let (mut state, _) = self
+            .shared
+            .changed
+            .wait_timeout_while(state, timeout, is_quiet)
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some(item) = state.items.pop_front() {
+            drop(state);
+            self.shared.changed.notify_all();
+            return Received::Item(item);
+        }
+        if state.sender_is_alive {
+            Received::Nothing
+        } else {
+            Received::Ended
+        }
+    }
+
+    /// Items that wait.
+    pub fn len(&self) -> usize {
+        self.shared.lock().items.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     pub fn dropped(&self) -> u64 {
         self.shared.lock().dropped
     }
@@ -184,6 +190,15 @@ impl<T> Receiver<T> {
     pub fn name(&self) -> &'static str {
         self.shared.name
     }
+}
+
+/// What came within the time that somebody waited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Received<T> {
+    Item(T),
+    Nothing,
+    /// No more will come.
+    Ended,
 }
 
 /// The sender is gone and every item was taken.

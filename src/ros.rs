@@ -4,6 +4,7 @@
 //! encapsulation header, which says little (CDR_LE) or big endian (CDR_BE). Knows nothing of files or networks.
 
 pub mod odometry;
+pub mod standard;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -40,6 +41,15 @@ pub trait Message {
 
 /// CDR payload -> message. Extra bytes behind the message are allowed (rosbag2 pads), missing ones are an error.
 pub fn decode<T: Message + DeserializeOwned>(payload: &[u8]) -> Result<T, CdrError> {
+    decode_as(payload, T::TYPE_NAME)
+}
+
+/// The same for parts of a service, which are no messages of their own.
+pub fn decode_plain<T: DeserializeOwned>(payload: &[u8]) -> Result<T, CdrError> {
+    decode_as(payload, std::any::type_name::<T>())
+}
+
+fn decode_as<T: DeserializeOwned>(payload: &[u8], type_name: &'static str) -> Result<T, CdrError> {
     let Some((header, body)) = payload.split_first_chunk::<4>() else {
         return Err(CdrError::TooShort {
             found_bytes: payload.len(),
@@ -53,19 +63,19 @@ pub fn decode<T: Message + DeserializeOwned>(payload: &[u8]) -> Result<T, CdrErr
     message
         .map(|(message, _)| message)
         .map_err(|e| CdrError::Decode {
-            type_name: T::TYPE_NAME,
+            type_name,
             reason: e.to_string(),
         })
 }
 
 /// Message -> little-endian CDR payload with header.
 pub fn encode<T: Message + Serialize>(message: &T) -> Result<Vec<u8>, CdrError> {
-    let body = cdr_encoding::to_vec::<T, byteorder::LittleEndian>(message).map_err(|e| {
-        CdrError::Encode {
-            type_name: T::TYPE_NAME,
-            reason: e.to_string(),
-        }
-    })?;
+    encode_plain(message)
+}
+
+/// The same for parts of a service.
+pub fn encode_plain<T: Serialize>(message: &T) -> Result<Vec<u8>, CdrError> {
+    let body = to_cdr(message)?;
     let mut payload = Vec::with_capacity(body.len() + 4);
     payload.extend_from_slice(&[0, 1, 0, 0]);
     payload.extend_from_slice(&body);
@@ -306,6 +316,27 @@ macro_rules! pose_def {
         )
     };
 }
+macro_rules! image_body {
+    () => {
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
+    };
+}
+macro_rules! camera_info_body {
+    () => {
+        concat!(
+            "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n",
+            "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nRegionOfInterest roi\n"
+        )
+    };
+}
+macro_rules! region_def {
+    () => {
+        concat!(
+            separator!(),
+            "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n"
+        )
+    };
+}
 macro_rules! transform_stamped_body {
     () => {
         "std_msgs/Header header\nstring child_frame_id\nTransform transform\n"
@@ -323,14 +354,14 @@ macro_rules! transform_defs {
 }
 
 // `publish/wire.rs` completes the definitions of msgs/ with these.
-pub(crate) use {header_def, pose_def, quaternion_def, separator, time_def, vector_defs};
+pub(crate) use {
+    camera_info_body, header_def, image_body, pose_def, quaternion_def, region_def, separator,
+    time_def, transform_defs, vector_defs,
+};
 
 impl Message for Image {
     const TYPE_NAME: &'static str = "sensor_msgs/msg/Image";
-    const DEFINITION: &'static str = concat!(
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n",
-        header_def!()
-    );
+    const DEFINITION: &'static str = concat!(image_body!(), header_def!());
 }
 
 impl Message for CompressedImage {
@@ -343,13 +374,7 @@ impl Message for CompressedImage {
 
 impl Message for CameraInfo {
     const TYPE_NAME: &'static str = "sensor_msgs/msg/CameraInfo";
-    const DEFINITION: &'static str = concat!(
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n",
-        "float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nRegionOfInterest roi\n",
-        header_def!(),
-        separator!(),
-        "MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n"
-    );
+    const DEFINITION: &'static str = concat!(camera_info_body!(), header_def!(), region_def!());
 }
 
 impl Message for PoseStamped {

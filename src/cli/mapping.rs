@@ -11,8 +11,9 @@ use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
 use crate::node::localise;
-use crate::node::pipeline::{self, Subscriber};
-use crate::node::{Job, Outcome, Progress, Stop, linger, run_dir, subscriber};
+use crate::node::pipeline;
+use crate::node::ros2;
+use crate::node::{Job, Outcome, Progress, Stop, linger, outbox, run_dir};
 use crate::source;
 
 pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
@@ -22,7 +23,21 @@ pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
             .set("source.rate", 1.0.into())
             .map_err(|e| usage(&e))?;
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.source, args.out.as_deref())
+}
+
+/// `--map` is `map.load`.
+fn load(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
+    if let Some(map) = map {
+        let path = map
+            .to_str()
+            .ok_or_else(|| Usage(format!("--map {} is no text", map.display())))?;
+        settings
+            .set("map.load", path.into())
+            .map_err(|e| usage(&e))?;
+    }
+    Ok(())
 }
 
 pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
@@ -54,6 +69,7 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
             settings.set(key, value).map_err(|e| usage(&e))?;
         }
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.input, args.out.as_deref())
 }
 
@@ -69,15 +85,16 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     source.end_when(stop.flag());
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
+    let told = &found.tracking;
     if args.json {
         say(serde_json::to_string_pretty(&found)?);
     } else {
         say(format!(
             "{} of {} frames found among {} keyframes, {} times lost, {} times found again",
-            found.tracked, found.frames, found.map_keyframes, found.lost, found.relocalised
+            told.tracked, told.frames, found.map_keyframes, told.lost, told.relocalised
         ));
     }
-    if found.tracked == 0 {
+    if told.tracked == 0 {
         let reason = found
             .reason
             .unwrap_or_else(|| "there are no frames".to_owned());
@@ -108,27 +125,36 @@ fn usage(error: &ConfigError) -> Usage {
 }
 
 fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<ExitCode> {
-    let params = settings.params().map_err(|e| usage(&e))?;
     let is_terminal = std::io::stderr().is_terminal();
     if let Some(out) = out {
         run_dir::prepare(out)?;
     }
     run_dir::start_log(out, is_terminal)?;
+    let mut settings = settings.clone();
+    let ros2 = ros2::join(&mut settings, input)?;
+    let settings = &settings;
+    let params = settings.params().map_err(|e| usage(&e))?;
     // A network that cannot be used is better known before the work than after it.
     let lpips = lpips::lpips(&params.eval.lpips_model)?;
     let source = source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
-    let subscriber: Option<Box<dyn Subscriber>> = subscriber(&params.publish)?;
+    let face = ros2.as_ref().map(ros2::Node::face).transpose()?;
+    let outbox = outbox(&params, face)?;
+    if let (Some(node), Some(outbox)) = (&ros2, &outbox) {
+        node.serve(outbox, &stop, params.ros2.autostart)?;
+    }
     let is_live = source.is_live() || params.source.rate > 0.0;
     let job = Job {
         source,
         params: params.clone(),
         is_live,
         stop: stop.clone(),
+        out: out.map(Path::to_owned),
+        outbox,
     };
     let bar = bar(is_terminal);
-    let outcome = pipeline::run(job, subscriber, &mut |progress| show(&bar, progress));
+    let outcome = pipeline::run(job, &mut |progress| show(&bar, progress));
     bar.finish_and_clear();
     let mut outcome = outcome?;
     let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;
@@ -146,6 +172,14 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
         anyhow::bail!(
             "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
             outcome.snapshot.poses.len()
+        );
+    }
+    if let Some(continued) = outcome.map.continuation().filter(|c| !c.is_joined) {
+        anyhow::bail!(
+            "the recording has no place in the map: {} of {} keyframes were found among the {} of the map, 3 or more must agree; the saved map is as it was, and the recording must see what it was made of, in similar light: {input}",
+            continued.found,
+            continued.asked,
+            continued.keyframes
         );
     }
     if outcome.snapshot.poses.is_empty() {

@@ -10,6 +10,8 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::source::ros2::names::split_arguments;
+
 /// Camera frames in, refined poses and a 3D Gaussian splat map out.
 #[derive(Debug, Parser)]
 #[command(version, about, propagate_version = true)]
@@ -60,12 +62,15 @@ struct ParamArgs {
 
 #[derive(Debug, Args)]
 struct RunArgs {
-    /// v4l2:/dev/video0, webcam:0, mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
+    /// v4l2:/dev/video0, webcam:0, ros2:/TOPIC, mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
     #[arg(long, value_name = "URI")]
     source: String,
     /// Run directory to write at the end
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -78,6 +83,9 @@ struct ReplayArgs {
     /// Run directory to write
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// Multiple of the recorded speed, or max; with a number late frames are dropped and counted
     #[arg(long, value_name = "R|max")]
     rate: Option<String>,
@@ -232,8 +240,13 @@ struct ModelCheckArgs {
 
 /// Runs the program: exit 0 done, 1 failed with one line that says why, 2 usage.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let (arguments, ros_arguments) = split_arguments(std::env::args_os());
+    let cli = Cli::parse_from(arguments);
     let result = match cli.command {
+        _ if !ros_arguments.is_empty() && !cfg!(feature = "ros2") => Err(Usage(
+            "arguments behind --ros-args need a build with ROS 2; docs/ROS2.md says how".to_owned(),
+        )
+        .into()),
         Command::Run(args) => mapping::run(&args),
         Command::Replay(args) => mapping::replay(&args),
         Command::Localise(args) => mapping::localise(&args),

@@ -4,10 +4,14 @@
 //! `--set` may change any key that the embedded file has, within the range that its comment states.
 
 pub mod align;
+pub mod describe;
 mod file;
 mod known;
+pub mod live;
 pub mod onnx;
+mod publish;
 mod range;
+pub mod ros2;
 pub mod scale;
 mod source;
 pub mod track;
@@ -20,10 +24,13 @@ use serde::Deserialize;
 use serde_json::Value;
 
 pub use self::known::KnownParams;
+pub use self::publish::{PublishParams, TfMode};
+pub use self::range::Range;
 pub use self::source::{CameraParams, RecordParams, SourceParams};
 use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
-use crate::config::range::{Range, ranges_of_comments};
+use crate::config::range::ranges_of_comments;
+use crate::config::ros2::Ros2Params;
 
 /// Named sets of values in `launch/presets`.
 const PRESETS: [(&str, &str); 1] = [("paper", include_str!("../../launch/presets/paper.yaml"))];
@@ -56,6 +63,10 @@ pub enum ConfigError {
         "parameters select.batch_overlap = {overlap} and select.batch_size = {size} do not fit: the overlap must be smaller"
     )]
     Overlap { overlap: usize, size: usize },
+    #[error(
+        "parameter {key} is read at the start only: set it in a parameter file, by --set or behind --ros-args, and start anew"
+    )]
+    Fixed { key: String },
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -66,6 +77,7 @@ pub struct Params {
     pub deterministic: bool,
     pub geometry: String,
     pub sequential: bool,
+    pub use_sim_time: bool,
     pub source: SourceParams,
     pub record: RecordParams,
     pub select: SelectParams,
@@ -79,6 +91,7 @@ pub struct Params {
     pub scale: scale::ScaleParams,
     pub eval: EvalParams,
     pub publish: PublishParams,
+    pub ros2: Ros2Params,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -165,6 +178,12 @@ pub struct MapParams {
     pub max_side: u32,
     pub final_share: f64,
     pub max_splats: usize,
+    pub max_gpu_mib: u64,
+    pub max_keyframes_in_ram: usize,
+    pub max_disk_mib: u64,
+    pub load: String,
+    pub save_pictures: u64,
+    pub autosave_secs: f64,
     pub seeds_per_keyframe: usize,
     pub sh_degree: u8,
     pub holdout: u32,
@@ -200,20 +219,6 @@ pub struct MapParams {
 #[serde(deny_unknown_fields)]
 pub struct EvalParams {
     pub lpips_model: String,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PublishParams {
-    pub zenoh: bool,
-    pub zenoh_listen: String,
-    pub zenoh_connect: String,
-    pub zenoh_config: String,
-    pub scouting: bool,
-    pub domain_id: u32,
-    pub namespace: String,
-    pub chunk_bytes: usize,
-    pub linger_secs: f64,
 }
 
 /// Values by dotted key; every key of the embedded file is there.
@@ -319,6 +324,10 @@ impl Settings {
         };
         self.values.insert(key.to_owned(), value);
         Ok(())
+    }
+
+    pub fn value(&self, key: &str) -> Option<&Value> {
+        self.values.get(key)
     }
 
     /// All keys with their values, for logs and reports.

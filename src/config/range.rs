@@ -6,7 +6,7 @@ use serde_json::Value;
 
 /// What a value may be, read from the comment behind its default.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Range {
+pub enum Range {
     Number { min: f64, max: f64 },
     Choice(Vec<String>),
     Flag,

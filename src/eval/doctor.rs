@@ -70,7 +70,11 @@ impl Check {
 pub fn doctor() -> Vec<Check> {
     let here = Path::new(".");
     let named_onnx_runtime = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
-    vec![
+    #[cfg_attr(
+        not(feature = "ros2"),
+        expect(unused_mut, reason = "ROS 2 adds its own")
+    )]
+    let mut checks = vec![
         cpu(),
         memory(free_mib()),
         write_access(here),
@@ -81,7 +85,10 @@ pub fn doctor() -> Vec<Check> {
         cameras::cameras(),
         onnx_runtime(named_onnx_runtime, &library_folders()),
         multicast(),
-    ]
+    ];
+    #[cfg(feature = "ros2")]
+    checks.extend(ros2_pictures());
+    checks
 }
 
 /// One line a check and one a fix, and a last line with the verdict.
@@ -223,22 +230,64 @@ fn vulkan_driver(icd_files: &[PathBuf]) -> Check {
     Check::ok("vulkan driver", names.join(", "))
 }
 
-fn ros2(distro: Option<String>, root: &Path) -> Check {
-    if let Some(distro) = distro.filter(|distro| !distro.is_empty()) {
-        return Check::ok("ros 2", format!("{distro} is sourced"));
-    }
-    match entries(root).first() {
-        Some(installed) => Check::optional(
+/// `sourced`: the distribution in the environment. `root`: where distributions are installed.
+fn ros2(sourced: Option<String>, root: &Path) -> Check {
+    let sourced = sourced.filter(|distro| !distro.is_empty());
+    let build = "cargo build --release --features ros2 where ROS 2 is sourced (docs/ROS2.md)";
+    match (sourced, entries(root).first()) {
+        (Some(distro), _) if cfg!(feature = "ros2") => Check::ok(
             "ros 2",
-            "installed, not sourced; this version reads recordings and speaks zenoh, a later one ROS 2 too",
-            format!("source {}/setup.bash", installed.display()),
+            format!("{distro} is sourced, and this build speaks it"),
         ),
-        None => Check::optional(
+        (Some(distro), _) => Check::optional(
             "ros 2",
-            "none; this version reads recordings and speaks zenoh, a later one ROS 2 too",
+            format!("{distro} is sourced; this build reads recordings and speaks zenoh only"),
+            build,
+        ),
+        (None, Some(installed)) => Check::optional(
+            "ros 2",
+            "installed, not sourced; recordings and zenoh work without",
+            format!("source {}/setup.bash, then {build}", installed.display()),
+        ),
+        (None, None) => Check::optional(
+            "ros 2",
+            "none; recordings and zenoh work without",
             "install a ROS 2 distribution (docs.ros.org) and source its setup.bash",
         ),
     }
+}
+
+/// What there is to subscribe to, and whether pictures will come through.
+#[cfg(feature = "ros2")]
+fn ros2_pictures() -> Vec<Check> {
+    let topics = match crate::source::ros2::watch::look_around() {
+        Ok(topics) if topics.is_empty() => Check::optional(
+            "ros 2 pictures",
+            "nobody publishes pictures here",
+            "start the camera's driver, with the same ROS_DOMAIN_ID",
+        ),
+        Ok(topics) => Check::ok("ros 2 pictures", topics.join(", ")),
+        Err(e) => Check::optional("ros 2 pictures", e.to_string(), "source ROS 2 once more"),
+    };
+    let names = [
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+    ];
+    let is_profiled = names
+        .into_iter()
+        .any(|name| std::env::var_os(name).is_some_and(|file| Path::new(&file).is_file()));
+    let is_fast_dds =
+        std::env::var("RMW_IMPLEMENTATION").map_or(true, |name| name.contains("fastrtps"));
+    let profile = if is_profiled || !is_fast_dds {
+        Check::ok("ros 2 transport", "fit for pictures")
+    } else {
+        Check::optional(
+            "ros 2 transport",
+            "Fast DDS by its defaults loses most best-effort pictures",
+            "export FASTRTPS_DEFAULT_PROFILES_FILE=launch/fastdds.xml here and for the camera's driver",
+        )
+    };
+    vec![topics, profile]
 }
 
 fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {

@@ -8,7 +8,7 @@ use crate::map::schedule::Phase;
 use crate::map::seed::{self, SeedView};
 use crate::map::transient;
 use crate::pose::Rigid;
-use crate::splat::{McmcSettings, Rendering};
+use crate::splat::{McmcSettings, Rendering, Splats};
 
 /// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
 /// is not under optimisation, and its splats are no measure of anything.
@@ -71,6 +71,7 @@ impl SplatMap {
         seeds.truncate(room);
         if !seeds.is_empty() {
             self.engine.append(&seeds);
+            self.number_splats();
         }
     }
 
@@ -84,7 +85,7 @@ impl SplatMap {
             .map(|i| splats.is_finite(i) && is_alive(i))
             .collect();
         if keep.iter().any(|k| !k) {
-            self.engine.retain(&keep);
+            self.retain(&keep);
         }
     }
 
@@ -99,12 +100,61 @@ impl SplatMap {
             seed: (self.seed ^ self.n_steps) as u32,
         };
         self.engine.relocate_and_grow(&settings);
+        self.number_splats();
+    }
+
+    /// After splats were added.
+    pub(super) fn number_splats(&mut self) {
+        if self.ids.grow_to(self.engine.n_splats()) {
+            self.epoch += 1;
+        }
+        self.note_peaks();
+    }
+
+    pub(super) fn retain(&mut self, keep: &[bool]) {
+        self.engine.retain(keep);
+        self.ids.retain(keep);
+    }
+
+    /// Clients and viewers rely on finite numbers.
+    pub(super) fn finite_splats(&mut self) -> (Splats, Vec<u32>) {
+        let splats = self.engine.splats();
+        let ids = self.ids.all();
+        let finite = (0..splats.len()).filter(|i| splats.is_finite(*i));
+        let ids = finite.map(|i| ids[i]).collect();
+        (splats.into_finite(), ids)
     }
 
     /// While the end is known to be far, part of the room is kept for what is still to be seen.
-    fn cap(&self) -> usize {
+    fn cap(&mut self) -> usize {
+        let most = self.most_splats();
         let share = self.progress.map_or(1.0, |p| (FIRST_ROOM + p).min(1.0));
-        (self.params.max_splats as f64 * share) as usize
+        // What a saved map brought needs no share.
+        let before = self.past.as_ref().map_or(0, |past| past.n_splats.min(most));
+        before + ((most - before) as f64 * share) as usize
+    }
+
+    /// What the budgets allow in all.
+    pub(super) fn most_splats(&mut self) -> usize {
+        let by_number = self.params.max_splats;
+        if self.params.max_gpu_mib == 0 {
+            return by_number;
+        }
+        let by_bytes = {
+            let budget = self.params.max_gpu_mib << 20;
+            let kept = self.bytes_for_views();
+            self.engine.room_within(budget.saturating_sub(kept))
+        };
+        if by_bytes < by_number && self.engine.n_splats() >= by_bytes {
+            if self.peaks.n_refused == 0 {
+                tracing::warn!(
+                    "map.max_gpu_mib = {} has room for {by_bytes} splats of map.max_splats = {by_number}: no more are added; said once",
+                    self.params.max_gpu_mib
+                );
+            }
+            self.peaks.n_refused += 1;
+        }
+        by_number.min(by_bytes)
     }
 
     /// A keyframe's camera as it is refined by now.
@@ -129,6 +179,9 @@ impl SplatMap {
         let rendering = camera.and_then(|camera| self.shown(&camera, self.params.sh_degree));
         let placed = self.keyframes.placed.get(&keyframe_id);
         if let Some((placed, rendering)) = placed.zip(rendering) {
+            if placed.image.is_hollow() {
+                return;
+            }
             let mask = transient::mask(&placed.image, &rendering, self.params.transient);
             self.engine.set_mask(placed.view_ix, mask);
         }

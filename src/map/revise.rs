@@ -119,7 +119,7 @@ impl SplatMap {
         tracing::warn!(
             "component {component} with {n} keyframes takes the place of the map of {own}"
         );
-        self.engine.retain(&vec![false; self.engine.n_splats()]);
+        self.retain(&vec![false; self.engine.n_splats()]);
         let old_component = self.component.unwrap_or_default();
         for (id, placed) in std::mem::take(&mut self.keyframes.placed) {
             let view = View {

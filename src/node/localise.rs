@@ -5,32 +5,27 @@ use std::path::Path;
 use anyhow::{Context as _, bail};
 use serde::Serialize;
 
-use crate::clock::{Stamp, Stopwatch};
+use crate::clock::Stopwatch;
 use crate::config::Params;
 use crate::eval::frames;
-use crate::eval::report::percentile;
+use crate::eval::report::TrackingFigures;
 use crate::eval::trajectory::write_tum;
 use crate::map::checkpoint;
 use crate::node::Stop;
+use crate::node::run_dir::tracking_figures;
+use crate::node::track_stage::TrackStage;
 use crate::source::Source;
-use crate::track::{State, Tracker};
+use crate::track::Tracker;
 
 /// What came of it, `localisation.json`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Localisation {
     /// Keyframes of the map that can be recognised.
     pub map_keyframes: usize,
-    pub frames: u64,
-    /// With a pose measured when they came.
-    pub tracked: u64,
-    /// Times that the tracker got lost, and was found again without a hint.
-    pub lost: u64,
-    pub relocalised: u64,
+    #[serde(flatten)]
+    pub tracking: TrackingFigures,
     /// Seconds of the recording from the first frame to the first pose.
     pub first_pose_s: Option<f64>,
-    /// Milliseconds of work per frame.
-    pub work_ms_p50: Option<f64>,
-    pub work_ms_p95: Option<f64>,
     /// Why the last frame without a pose has none.
     pub reason: Option<String>,
 }
@@ -50,47 +45,27 @@ pub fn localise(
             map.display()
         );
     }
-    let mut tracker = Tracker::in_saved(&landmarks, &params.track)
+    let tracker = Tracker::in_saved(&landmarks, &params.track)
         .map_err(anyhow::Error::msg)
         .with_context(|| format!("cannot find a place in {}", map.display()))?;
-    let mut found = Localisation {
-        map_keyframes: tracker.n_keyframes(),
-        frames: 0,
-        tracked: 0,
-        lost: 0,
-        relocalised: 0,
-        first_pose_s: None,
-        work_ms_p50: None,
-        work_ms_p95: None,
-        reason: None,
-    };
-    let mut first: Option<Stamp> = None;
-    let mut work_ms = Vec::new();
-    let mut stamps = Vec::new();
+    let map_keyframes = tracker.n_keyframes();
+    let mut stage = TrackStage::of(Some(tracker), false);
     while let Some(frame) = source.next().filter(|_| !stop.is_asked()) {
-        let watch = Stopwatch::start();
-        let tracked = tracker.track(&frame);
-        work_ms.push(watch.secs() * 1e3);
-        stamps.push(frame.stamp);
-        let start = *first.get_or_insert(frame.stamp);
-        if tracked.is_measured() {
-            found
-                .first_pose_s
-                .get_or_insert(frame.stamp.secs_since(start));
-        } else {
-            found.reason = tracked.reason.map(|reason| reason.to_string());
-        }
-        if tracked.state == State::Relocalised {
-            tracing::info!("found again at {}", frame.stamp);
-        }
+        stage.track(&frame, &Stopwatch::start());
     }
-    let tracks = tracker.finish();
-    (found.frames, found.tracked) = (tracks.n_frames, tracks.n_tracked);
-    (found.lost, found.relocalised) = (tracks.n_lost, tracks.n_relocalised);
-    found.work_ms_p50 = percentile(&work_ms, 0.5);
-    found.work_ms_p95 = percentile(&work_ms, 0.95);
+    let tracking = stage.finish(0);
+    let tracks = &tracking.tracks.frames;
+    let rows = frames::rows(&[], tracks, &[]);
+    let first_posed = tracks.iter().find(|track| track.live.is_some());
+    let first_pose = tracks.first().zip(first_posed);
+    let last_missed = tracks.iter().rev().find(|track| track.live.is_none());
+    let found = Localisation {
+        map_keyframes,
+        tracking: tracking_figures(&tracking, &rows),
+        first_pose_s: first_pose.map(|(first, posed)| posed.stamp.secs_since(first.stamp)),
+        reason: last_missed.and_then(|track| Some(track.reason?.to_string())),
+    };
     if let Some(out) = out {
-        let rows = frames::rows(&[], &tracks.frames, &stamps);
         write_tum(&frames::trajectory(&rows), &out.join("trajectory.tum"))?;
         frames::write_frames(&rows, &out.join("frames.csv"))?;
         let text = serde_json::to_vec_pretty(&found)?;

@@ -2,13 +2,18 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod autosave;
 pub mod localise;
+mod opening;
+mod outward;
 pub mod pipeline;
+pub mod ros2;
 pub mod run_dir;
 mod stages;
+mod threads;
 pub mod track_stage;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -16,7 +21,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 
 use crate::clock::{Stamp, Stopwatch};
-use crate::config::{Backend, Params, PublishParams};
+use crate::config::{Backend, Params};
 use crate::geometry::GeometryModel;
 use crate::geometry::align::Aligner;
 use crate::geometry::known::Known;
@@ -25,10 +30,12 @@ use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
-use crate::map::snapshot::{Scale, Snapshot};
-use crate::node::pipeline::Subscriber;
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
+use crate::node::outward::Clerk;
 use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
+use crate::publish::face::Face;
+use crate::publish::outbox::Outbox;
 use crate::source::{Source, SourceCounts};
 use crate::splat::Engine;
 use crate::splat::cpu::CpuEngine;
@@ -44,6 +51,10 @@ pub struct Job {
     /// A live source drops frames rather than wait, and the map is optimised as long as frames come.
     pub is_live: bool,
     pub stop: Stop,
+    /// Run directory: autosaves go there, and what memory has no room for.
+    pub out: Option<PathBuf>,
+    /// The way out, where anything is to go out before the end.
+    pub outbox: Option<Arc<Outbox>>,
 }
 
 impl std::fmt::Debug for Job {
@@ -56,6 +67,7 @@ impl std::fmt::Debug for Job {
 #[derive(Debug, Clone, Default)]
 pub struct Stop {
     is_asked: Arc<AtomicBool>,
+    is_restarting: Arc<AtomicBool>,
 }
 
 impl Stop {
@@ -68,8 +80,19 @@ impl Stop {
         &self.is_asked
     }
 
+    /// Ends this map for a fresh one from the same source.
+    fn ask_restart(&self) {
+        self.is_restarting.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether a fresh map is to begin; forgets it.
+    fn takes_restart(&self) -> bool {
+        self.is_restarting.swap(false, Ordering::Relaxed) && !self.is_asked()
+    }
+
     pub fn is_asked(&self) -> bool {
-        self.is_asked.load(Ordering::Relaxed)
+        let is_set = |flag: &AtomicBool| flag.load(Ordering::Relaxed);
+        is_set(&self.is_asked) || is_set(&self.is_restarting)
     }
 }
 
@@ -81,6 +104,8 @@ pub struct Progress {
     pub n_splats: usize,
     pub n_steps: u64,
     pub steps_planned: u64,
+    /// The map changes no more.
+    pub has_ended: bool,
 }
 
 /// Wall seconds, summed over the run.
@@ -114,8 +139,16 @@ pub struct Outcome {
     pub geometry_note: Option<String>,
     /// The stage that failed, and how; what was gathered before is kept.
     pub error: Option<String>,
-    /// Given back so that it can stay up for late joiners.
-    pub subscriber: Option<Box<dyn Subscriber>>,
+    /// Stays up for late joiners until `linger` has closed it.
+    pub outbox: Option<Arc<Outbox>>,
+    clerk: Clerk,
+}
+
+impl Outcome {
+    /// Keyframes of this run, without those of a saved map.
+    pub fn own_poses(&self) -> &[KeyframePose] {
+        self.map.own(&self.snapshot.poses)
+    }
 }
 
 impl std::fmt::Debug for Outcome {
@@ -203,52 +236,30 @@ fn spawn<T: Send + 'static>(
         .with_context(|| format!("cannot start thread {name}"))
 }
 
-/// The publisher that the parameters ask for.
-#[cfg(feature = "zenoh")]
-pub fn subscriber(params: &PublishParams) -> anyhow::Result<Option<Box<dyn Subscriber>>> {
-    use crate::publish::zenoh::ZenohPublisher;
-
-    struct Zenoh(ZenohPublisher);
-
-    impl Subscriber for Zenoh {
-        fn publish(&mut self, snapshot: &Arc<Snapshot>) {
-            // A client that is gone or slow must not end the run.
-            if let Err(e) = self.0.publish(snapshot) {
-                tracing::warn!("snapshot {} was not published: {e}", snapshot.revision);
-            }
-        }
-
-        fn close(self: Box<Self>) {
-            if let Err(e) = self.0.close() {
-                tracing::warn!("zenoh did not close cleanly: {e}");
-            }
-        }
-    }
-
-    if !params.zenoh {
+/// The way out that the parameters ask for, if any, and over `face`.
+pub fn outbox(params: &Params, face: Option<Box<dyn Face>>) -> anyhow::Result<Option<Arc<Outbox>>> {
+    let (publish, has_face) = (&params.publish, face.is_some());
+    if !(publish.zenoh || has_face || !publish.record.is_empty()) {
         return Ok(None);
     }
-    let publisher = ZenohPublisher::open(params)?;
-    tracing::info!("zenoh listens on {}", publisher.endpoints().join(" "));
-    Ok(Some(Box::new(Zenoh(publisher))))
+    let outbox = Outbox::open(publish)?;
+    Ok(Some(Arc::new(match face {
+        Some(face) => outbox.with_face(face),
+        None => outbox,
+    })))
 }
 
-#[cfg(not(feature = "zenoh"))]
-pub fn subscriber(params: &PublishParams) -> anyhow::Result<Option<Box<dyn Subscriber>>> {
-    if params.zenoh {
-        bail!("publish.zenoh is true, but this build has no zenoh; build with --features zenoh");
-    }
-    Ok(None)
-}
-
-/// Keeps the publisher up for late subscribers, then closes it; Ctrl-C cuts the wait short.
+/// Keeps the way out up for late joiners and services, then closes it; Ctrl-C cuts the wait short.
 pub fn linger(outcome: &mut Outcome, secs: f64, stop: &Stop) {
-    let Some(subscriber) = outcome.subscriber.take() else {
+    let Some(outbox) = outcome.outbox.take() else {
         return;
     };
     let watch = Stopwatch::start();
     while watch.secs() < secs && !stop.is_asked() {
+        outcome.clerk.serve(&mut outcome.map);
         std::thread::sleep(LINGER_TICK);
     }
-    subscriber.close();
+    if let Err(e) = outbox.close() {
+        tracing::warn!("the way out did not close cleanly: {e}");
+    }
 }

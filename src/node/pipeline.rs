@@ -1,69 +1,86 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
 use std::sync::Arc;
-
-use anyhow::anyhow;
+use std::sync::mpsc::Receiver as Calls;
+use std::time::Duration;
 
 use crate::clock::Stopwatch;
-use crate::frame::{Batch, Frame};
-use crate::geometry::{GeometryBatch, GeometryError};
-use crate::map::SplatMap;
+use crate::frame::Batch;
+use crate::geometry::GeometryError;
 use crate::map::snapshot::Snapshot;
+use crate::node::opening;
+use crate::node::outward::{self, run_live, run_publisher};
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
-use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
-use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
-use crate::queue::{Ended, Receiver, Sender, WhenFull, queue};
-use crate::source::SourceCounts;
+use crate::node::threads::{Answer, joined, run_geometry, run_select, run_source};
+use crate::node::track_stage::{News, TrackStage, Tracking, policies, run_track};
+use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
+use crate::publish::outbox::Outbox;
+use crate::publish::service::Call;
+use crate::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
 
 /// Frames between source and selection.
 const FRAME_QUEUE: usize = 4;
 /// Frames before the tracker: live, an older one is worth nothing once two newer ones are there.
 const HEARD_QUEUE: usize = 2;
+/// Poses on their way out.
+const EVENT_QUEUE: usize = 8;
+/// How long a call from outside may wait while the map has nothing to do.
+const CALL_TICK: Duration = Duration::from_millis(100);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
 const NEWS_SECS: f64 = 1.0;
 
-/// What crosses from geometry to the map; no batch at the model's end.
-type Answer = (Option<Arc<Batch>>, GeometryBatch);
-
-/// Takes snapshots on their way out, newest wins.
-pub trait Subscriber: Send {
-    fn publish(&mut self, snapshot: &Arc<Snapshot>);
-
-    fn close(self: Box<Self>);
+/// Runs a job to its end; a reset on the way throws the map away and goes on with the same source. `on_progress` is
+/// called on this thread.
+pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<Outcome> {
+    let watch = Stopwatch::start();
+    let mut calls = None;
+    loop {
+        let (params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
+        let (is_live, out) = (job.is_live, job.out.clone());
+        let mut ended = run_once(job, calls.take(), on_progress)?;
+        if !stop.takes_restart() {
+            let mut outcome = ended.into_outcome(outbox);
+            outcome.secs.wall = watch.secs();
+            return Ok(outcome);
+        }
+        tracing::info!("the map begins again");
+        calls = ended.map.clerk.take_calls();
+        job = Job {
+            source: ended.source.into_source(),
+            params,
+            is_live,
+            stop,
+            outbox,
+            out,
+        };
+    }
 }
 
-/// Runs a job to its end. `on_progress` is called on this thread, `subscriber` on its own.
-pub fn run(
+fn run_once(
     job: Job,
-    subscriber: Option<Box<dyn Subscriber>>,
+    calls: Option<Calls<Call>>,
     on_progress: &mut dyn FnMut(Progress),
-) -> anyhow::Result<Outcome> {
-    let watch = Stopwatch::start();
+) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
-    let n_frames = job.source.len_hint().filter(|n| *n > 0);
-    let map = SplatMap::new(
-        job.params.map.clone(),
-        job.params.seed,
-        scale,
-        engine(job.params.backend, job.params.deterministic)?,
-    )
-    .measuring_scale(&job.params.scale);
+    let opening::Opened {
+        map,
+        track,
+        first_id,
+    } = opening::open(&job, scale, calls)?;
+    let outbox = job.outbox;
     let stages = Stages {
-        map: MapStage::new(map, &job.params, job.is_live, job.stop.clone(), n_frames),
-        select: SelectStage::new(&job.params),
+        map,
+        select: SelectStage::new(&job.params, first_id),
         geometry: GeometryStage::new(model),
-        track: TrackStage::new(&job.params.track, job.is_live),
-        source: SourceStage::new(job.source, job.stop),
-        subscriber,
+        track: track.heard(outbox.is_some()),
+        source: SourceStage::new(job.source, job.stop, outbox.clone()),
+        outbox,
     };
-    let ended = if job.params.sequential {
-        stages.in_sequence(on_progress)
+    if job.params.sequential {
+        Ok(stages.in_sequence(on_progress))
     } else {
-        stages.on_threads(job.is_live, on_progress)?
-    };
-    let mut outcome = ended.into_outcome();
-    outcome.secs.wall = watch.secs();
-    Ok(outcome)
+        stages.on_threads(job.is_live, on_progress)
+    }
 }
 
 struct Stages {
@@ -72,32 +89,36 @@ struct Stages {
     geometry: GeometryStage,
     map: MapStage,
     track: TrackStage,
-    subscriber: Option<Box<dyn Subscriber>>,
+    outbox: Option<Arc<Outbox>>,
 }
 
 /// All stages after their end.
 struct End {
-    counts: SourceCounts,
+    source: SourceStage,
     n_dropped: u64,
-    decode_secs: f64,
     select: SelectStage,
     geometry: GeometryStage,
     map: MapStage,
     tracking: Tracking,
     snapshot: Arc<Snapshot>,
-    subscriber: Option<Box<dyn Subscriber>>,
     error: Option<String>,
 }
 
 impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
-        let mut subscriber = self.subscriber;
+        let outbox = self.outbox;
         let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
-            if let Some(subscriber) = &mut subscriber {
-                subscriber.publish(&snapshot);
+            if let Some(outbox) = &outbox {
+                outward::publish_or_say(outbox, &(snapshot, progress.has_ended));
             }
             on_progress(progress);
+        };
+        let tell = |track: &mut TrackStage| {
+            let events = track.take_events();
+            if let Some(outbox) = &outbox {
+                outward::say_all(outbox, &events);
+            }
         };
         let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
         let track = &mut self.track;
@@ -115,6 +136,7 @@ impl Stages {
                 break;
             };
             track.track(&frame, &Stopwatch::start());
+            tell(track);
             if let Some(batch) = select.push(frame) {
                 result = map_batch(batch, track);
             }
@@ -131,16 +153,15 @@ impl Stages {
         });
         let snapshot = map.finish(&mut publish);
         track.update(&map.map.keyframe_views());
+        tell(track);
         End {
             tracking: self.track.finish(0),
-            counts: self.source.counts(),
+            source: self.source,
             n_dropped: 0,
-            decode_secs: self.source.decode_secs,
             select: self.select,
             geometry: self.geometry,
             map: self.map,
             snapshot,
-            subscriber,
             error: result.err().map(|e| format!("geometry: {e}")),
         }
     }
@@ -174,7 +195,14 @@ impl Stages {
             (None, heard_tx)
         };
 
-        let track = spawn("track", move || run_track(self.track, &heard, &news))?;
+        let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
+        let live = match self.outbox.clone() {
+            Some(outbox) => Some(spawn("live", move || run_live(&outbox, &events))?),
+            None => None,
+        };
+        let track = spawn("track", move || {
+            run_track(self.track, &heard, &news, &events_tx)
+        })?;
         let source = spawn("source", move || {
             run_source(self.source, &frames_tx, from_source.as_ref())
         })?;
@@ -185,9 +213,10 @@ impl Stages {
             run_geometry(self.geometry, &batches, &answers_tx)
         })?;
         let map = spawn("map", move || {
-            let mut publish = |snapshot, progress| {
+            let mut publish = |snapshot, progress: Progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
-                drop(snapshots_tx.send(snapshot));
+                let is_last = progress.has_ended;
+                drop(snapshots_tx.send((snapshot, is_last)));
                 progress_tx.send(progress).ok();
             };
             run_map(
@@ -197,8 +226,9 @@ impl Stages {
                 &mut publish,
             )
         })?;
+        let outbox = self.outbox;
         let publisher = spawn("publish", move || {
-            run_publisher(self.subscriber, &snapshots)
+            run_publisher(outbox.as_deref(), &snapshots);
         })?;
 
         while let Some(progress) = progress.recv() {
@@ -208,36 +238,37 @@ impl Stages {
         let select = joined("select", select)?;
         let (geometry, error) = joined("geometry", geometry)?;
         let (map, snapshot) = joined("map", map)?;
-        let subscriber = joined("publish", publisher)?;
+        joined("publish", publisher)?;
         let tracking = joined("track", track)?;
+        if let Some(live) = live {
+            joined("live", live)?;
+        }
         Ok(End {
             tracking,
-            counts: source.counts(),
+            source,
             n_dropped,
-            decode_secs: source.decode_secs,
             select,
             geometry,
             map,
             snapshot,
-            subscriber,
             error: error.map(|e| format!("geometry: {e}")),
         })
     }
 }
 
 impl End {
-    fn into_outcome(self) -> Outcome {
+    fn into_outcome(self, outbox: Option<Arc<Outbox>>) -> Outcome {
         let fault = self.map.map.fault().map(|fault| format!("engine: {fault}"));
         Outcome {
             snapshot: self.snapshot,
-            counts: self.counts,
+            counts: self.source.counts(),
             n_dropped: self.n_dropped,
             n_selected: self.select.n_selected,
             frame_stamps: self.select.frame_stamps,
             truth: self.select.truth,
             secs: StageSecs {
                 wall: 0.0,
-                decode: self.decode_secs,
+                decode: self.source.decode_secs,
                 geometry: self.geometry.secs,
                 optimise: self.map.optimise_secs,
                 track: self.tracking.secs,
@@ -245,77 +276,12 @@ impl End {
             tracking: self.tracking,
             keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
+            clerk: self.map.clerk,
             map: self.map.map,
             geometry_note: self.geometry.note,
             error: self.error.or(fault),
-            subscriber: self.subscriber,
+            outbox,
         }
-    }
-}
-
-fn run_source(
-    mut stage: SourceStage,
-    frames: &Sender<Frame>,
-    heard: Option<&Sender<Heard>>,
-) -> (SourceStage, u64) {
-    while let Some(frame) = stage.next() {
-        tell(heard, &frame);
-        if frames.send(frame).is_err() {
-            break;
-        }
-    }
-    (stage, frames.dropped())
-}
-
-fn run_select(
-    mut stage: SelectStage,
-    frames: &Receiver<Frame>,
-    batches: &Sender<Arc<Batch>>,
-    heard: Option<&Sender<Heard>>,
-) -> SelectStage {
-    // The tracker hears of a batch before geometry does: news of a batch can always be taken, so that nobody waits in
-    // a circle.
-    let send = |batch: Batch| {
-        if let Some(heard) = heard {
-            drop(heard.send(Heard::Batch));
-        }
-        batches.send(Arc::new(batch)).is_ok()
-    };
-    while let Some(frame) = frames.recv() {
-        tell(heard, &frame);
-        if let Some(batch) = stage.push(frame)
-            && !send(batch)
-        {
-            return stage;
-        }
-    }
-    if let Some(batch) = stage.finish() {
-        send(batch);
-    }
-    stage
-}
-
-fn run_geometry(
-    mut stage: GeometryStage,
-    batches: &Receiver<Arc<Batch>>,
-    answers: &Sender<Answer>,
-) -> (GeometryStage, Option<GeometryError>) {
-    while let Some(batch) = batches.recv() {
-        match stage.infer(&batch) {
-            Ok(geometry) => {
-                if answers.send((Some(batch), geometry)).is_err() {
-                    return (stage, None);
-                }
-            }
-            Err(error) => return (stage, Some(error)),
-        }
-    }
-    match stage.finish() {
-        Ok(geometry) => {
-            drop(answers.send((None, geometry)));
-            (stage, None)
-        }
-        Err(error) => (stage, Some(error)),
     }
 }
 
@@ -337,11 +303,11 @@ fn run_map(
                     }
                     continue;
                 }
-                Ok(None) => answers.recv(),
+                Ok(None) => next_answer(&mut stage, answers),
                 Err(Ended) => None,
             }
         } else {
-            answers.recv()
+            next_answer(&mut stage, answers)
         };
         let Some((batch, geometry)) = answer else {
             break;
@@ -354,29 +320,20 @@ fn run_map(
     (stage, snapshot)
 }
 
+/// Waits, and serves calls from outside meanwhile.
+fn next_answer(stage: &mut MapStage, answers: &Receiver<Answer>) -> Option<Answer> {
+    loop {
+        match answers.recv_timeout(CALL_TICK) {
+            Received::Item(answer) => return Some(answer),
+            Received::Nothing => stage.serve(),
+            Received::Ended => return None,
+        }
+    }
+}
+
 fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
     if let Some(news) = news {
         // A tracker that is gone is no reason to stop mapping.
         drop(news.send(stage.map.keyframe_views()));
     }
-}
-
-fn run_publisher(
-    mut subscriber: Option<Box<dyn Subscriber>>,
-    snapshots: &Receiver<Arc<Snapshot>>,
-) -> Option<Box<dyn Subscriber>> {
-    while let Some(snapshot) = snapshots.recv() {
-        if let Some(subscriber) = &mut subscriber {
-            subscriber.publish(&snapshot);
-        }
-    }
-    subscriber
-}
-
-fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
-    thread.join().map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));
-        anyhow!("stage {name} broke: {}", text.unwrap_or_default())
-    })
 }

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -10,15 +12,20 @@ use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
+use crate::node::autosave::Autosave;
+use crate::node::outward::Clerk;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
+use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
-use crate::source::{Source, SourceCounts};
+use crate::source::{Polled, Source, SourceCounts};
 
 /// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
+/// A source that waits for the world is asked so often whether to go on.
+const PATIENCE: Duration = Duration::from_millis(100);
 /// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
 const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 
@@ -26,6 +33,8 @@ const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
 pub(super) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
+    outbox: Option<Arc<Outbox>>,
+    is_mounted: bool,
     pub(super) decode_secs: f64,
 }
 
@@ -53,8 +62,11 @@ pub(super) struct MapStage {
     is_live: bool,
     stop: Stop,
     n_frames: Option<u64>,
+    pub(super) clerk: Clerk,
+    outbox: Option<Arc<Outbox>>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
+    pub(super) autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
@@ -63,23 +75,62 @@ pub(super) struct MapStage {
 }
 
 impl SourceStage {
-    pub(super) fn new(mut source: Box<dyn Source>, stop: Stop) -> Self {
-        source.end_when(stop.flag());
+    pub(super) fn new(source: Box<dyn Source>, stop: Stop, outbox: Option<Arc<Outbox>>) -> Self {
         Self {
             source,
             stop,
+            outbox,
+            is_mounted: false,
             decode_secs: 0.0,
         }
     }
 
+    /// While paused, frames come and go.
     pub(super) fn next(&mut self) -> Option<Frame> {
-        if self.stop.is_asked() {
-            return None;
+        while !self.stop.is_asked() {
+            let watch = Stopwatch::start();
+            let polled = self.source.poll(PATIENCE);
+            if !matches!(polled, Polled::Waiting) {
+                self.decode_secs += watch.secs();
+            }
+            let Some(outbox) = self.outbox.as_ref() else {
+                match polled {
+                    Polled::Frame(frame) => return Some(*frame),
+                    Polled::Ended => return None,
+                    Polled::Waiting => continue,
+                }
+            };
+            let warnings = self.source.warnings();
+            outbox.note(|standing| standing.source_notes = warnings);
+            if let Polled::Frame(frame) = &polled {
+                if !self.is_mounted {
+                    let mount = self.source.mount();
+                    outbox.meet_camera(mount, self.source.camera_frame());
+                    self.is_mounted = mount.is_some();
+                }
+                outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
+            }
+            let switches = outbox.switches();
+            if switches.wants_reset.swap(false, Ordering::Relaxed) {
+                self.stop.ask_restart();
+                return None;
+            }
+            let is_paused = switches.is_paused.load(Ordering::Relaxed);
+            outbox.note(|standing| standing.is_paused = is_paused);
+            match polled {
+                Polled::Frame(frame) if !is_paused => return Some(*frame),
+                Polled::Frame(_) | Polled::Waiting => {}
+                Polled::Ended => {
+                    outbox.note(|standing| standing.has_ended = true);
+                    return None;
+                }
+            }
         }
-        let watch = Stopwatch::start();
-        let frame = self.source.next();
-        self.decode_secs += watch.secs();
-        frame
+        None
+    }
+
+    pub(super) fn into_source(self) -> Box<dyn Source> {
+        self.source
     }
 
     pub(super) fn counts(&self) -> SourceCounts {
@@ -88,9 +139,9 @@ impl SourceStage {
 }
 
 impl SelectStage {
-    pub(super) fn new(params: &Params) -> Self {
+    pub(super) fn new(params: &Params, first_id: u32) -> Self {
         Self {
-            selector: Selector::new(params.select.clone()),
+            selector: Selector::new(params.select.clone()).counting_from(first_id),
             batcher: Batcher::new(&params.select),
             n_selected: 0,
             frame_stamps: Vec::new(),
@@ -164,17 +215,21 @@ impl MapStage {
     pub(super) fn new(
         map: SplatMap,
         params: &Params,
-        is_live: bool,
+        (is_live, n_frames): (bool, Option<u64>),
         stop: Stop,
-        n_frames: Option<u64>,
+        outbox: Option<Arc<Outbox>>,
     ) -> Self {
+        let calls = outbox.as_ref().and_then(|outbox| outbox.take_calls());
         Self {
             map,
             params: params.map.clone(),
             is_live,
             stop,
             n_frames,
+            clerk: Clerk::new(calls, &params.track),
+            outbox,
             unpublished: BTreeMap::new(),
+            autosave: None,
             since_snapshot: Stopwatch::start(),
             n_keyframes: 0,
             optimise_secs: 0.0,
@@ -206,10 +261,15 @@ impl MapStage {
         let watch = Stopwatch::start();
         for id in self.map.add(batch, geometry, progress) {
             if let Some(age) = self.unpublished.get(&id) {
-                self.keyframe_to_pose_secs.push(age.secs());
+                let secs = age.secs();
+                self.keyframe_to_pose_secs.push(secs);
+                if let Some(outbox) = &self.outbox {
+                    outbox.note(|standing| standing.keyframe_to_pose.note(secs));
+                }
             }
         }
         self.optimise_secs += watch.secs();
+        self.note();
         if !self.is_live {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
@@ -242,9 +302,37 @@ impl MapStage {
             self.map.refine_held_out();
         }
         self.optimise_secs += watch.secs();
+        // The last map file must not be overtaken by an older one.
+        self.autosave = None;
         let snapshot = self.snapshot();
-        publish(Arc::clone(&snapshot), self.progress());
+        self.note();
+        let last = Progress {
+            has_ended: true,
+            ..self.progress()
+        };
+        publish(Arc::clone(&snapshot), last);
         snapshot
+    }
+
+    /// Calls from outside, while nothing else is to be done.
+    pub(super) fn serve(&mut self) {
+        self.clerk.serve(&mut self.map);
+    }
+
+    /// Writes the map's part of the status.
+    fn note(&self) {
+        let Some(outbox) = &self.outbox else { return };
+        let (map, optimise_secs) = (&self.map, self.optimise_secs);
+        outbox.note(|standing| {
+            standing.n_placed = map.n_keyframes() as u64;
+            standing.n_components = map.components().len() as u64;
+            standing.n_splats = map.n_splats() as u64;
+            standing.n_steps = map.n_steps();
+            standing.gpu_bytes = map.peak_gpu_bytes();
+            if optimise_secs > 0.0 {
+                standing.steps_per_s = map.n_steps() as f64 / optimise_secs;
+            }
+        });
     }
 
     fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
@@ -270,6 +358,7 @@ impl MapStage {
             if self.map.step(n, phase(self.map.n_steps())) == 0 {
                 break;
             }
+            self.clerk.serve(&mut self.map);
             self.snapshot_if_due(publish);
         }
     }
@@ -279,9 +368,11 @@ impl MapStage {
             let snapshot = self.snapshot();
             publish(snapshot, self.progress());
         }
+        Autosave::save_if_due(self.autosave.as_mut(), &mut self.map, &mut self.clerk);
     }
 
     fn snapshot(&mut self) -> Arc<Snapshot> {
+        self.note();
         let snapshot = self.map.snapshot();
         self.since_snapshot = Stopwatch::start();
         for pose in &snapshot.poses {
@@ -303,6 +394,7 @@ impl MapStage {
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
             steps_planned: if self.is_live { 0 } else { self.params.steps },
+            has_ended: false,
         }
     }
 }

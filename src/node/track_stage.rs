@@ -5,6 +5,11 @@ use std::collections::VecDeque;
 use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::frame::Frame;
+use crate::node::outward::LiveEvent;
+use crate::pose::Rigid;
+use crate::pose::Similarity;
+use crate::publish::overview::SeenKeyframe;
+use crate::publish::world::LiveFrame;
 use crate::queue::{Receiver, Sender, WhenFull};
 use crate::track::{KeyframeView, State, TrackedFrame, Tracker, Tracks};
 
@@ -12,6 +17,9 @@ use crate::track::{KeyframeView, State, TrackedFrame, Tracker, Tracks};
 const MAX_TIMES: usize = 100_000;
 /// Live, where the queue is never empty: frames after which news of the map are taken in all the same.
 const MAX_FRAMES_WITHOUT_NEWS: usize = 10;
+
+/// Seconds between landmarks for map files that somebody may ask for.
+const TELL_SECS: f64 = 20.0;
 
 /// What the tracker hears, in order.
 pub(super) enum Heard {
@@ -35,6 +43,15 @@ pub(super) struct TrackStage {
     secs: f64,
     frame_secs: VecDeque<f64>,
     latency_secs: VecDeque<f64>,
+    /// Who keeps landmarks for a map file that is written while the run goes on, how often, and since when.
+    saved_to: Option<(Sender<Vec<u8>>, f64, Stopwatch)>,
+    /// How the map has moved under the camera since the last frame.
+    moved: Option<Similarity>,
+    /// The last keyframe whose depth went out.
+    shown: Option<u32>,
+    /// What is to be said outside; kept empty where nobody listens.
+    events: Vec<LiveEvent>,
+    is_heard: bool,
 }
 
 /// What tracking leaves behind.
@@ -54,14 +71,63 @@ pub struct Tracking {
 
 impl TrackStage {
     pub(super) fn new(params: &TrackParams, is_live: bool) -> Self {
+        Self::of(params.enabled.then(|| Tracker::new(params)), is_live)
+    }
+
+    /// `None`: tracking is off.
+    pub(super) fn of(tracker: Option<Tracker>, is_live: bool) -> Self {
         Self {
-            tracker: params.enabled.then(|| Tracker::new(params)),
+            tracker,
             is_live,
             said: State::Initialising,
             secs: 0.0,
             frame_secs: VecDeque::new(),
             latency_secs: VecDeque::new(),
+            saved_to: None,
+            moved: None,
+            shown: None,
+            events: Vec::new(),
+            is_heard: false,
         }
+    }
+
+    /// Begins in a map that was saved, without an idea of where.
+    pub(super) fn begin_in(&mut self, saved: &[u8], params: &TrackParams) -> anyhow::Result<()> {
+        if self.tracker.is_some() && !saved.is_empty() {
+            let tracker = Tracker::in_saved(saved, params).map_err(anyhow::Error::msg)?;
+            self.tracker = Some(tracker);
+        }
+        Ok(())
+    }
+
+    /// From now on tells landmarks for map files that are written every `secs`; 0: whenever somebody asks.
+    pub(super) fn tell_landmarks(&mut self, secs: f64, to: Sender<Vec<u8>>) {
+        let secs = if secs > 0.0 { secs } else { TELL_SECS };
+        self.saved_to = Some((to, secs, Stopwatch::start()));
+    }
+
+    fn save_if_due(&mut self) {
+        let Some((to, secs, since)) = &mut self.saved_to else {
+            return;
+        };
+        // A little ahead of the map file that they are for.
+        if since.secs() < 0.5 * *secs {
+            return;
+        }
+        *since = Stopwatch::start();
+        if let Some(Ok(landmarks)) = self.tracker.as_ref().map(Tracker::saved) {
+            drop(to.send(landmarks));
+        }
+    }
+
+    /// What it finds is to be said outside.
+    pub(super) fn heard(self, is_heard: bool) -> Self {
+        Self { is_heard, ..self }
+    }
+
+    /// What has come up since the last time.
+    pub(super) fn take_events(&mut self) -> Vec<LiveEvent> {
+        std::mem::take(&mut self.events)
     }
 
     pub(super) fn is_on(&self) -> bool {
@@ -80,6 +146,16 @@ impl TrackStage {
             note(&mut self.latency_secs, since.secs());
         }
         self.say(&tracked);
+        let moved = self.moved.take();
+        if self.is_heard {
+            self.events.push(LiveEvent::Frame(Box::new(LiveFrame {
+                tracked,
+                odom_from_cam: frame.odometry,
+                base_from_cam: None,
+                moved,
+                latency_secs: since.secs(),
+            })));
+        }
     }
 
     /// In a replay, frames that the map has reached get their second look at once.
@@ -88,11 +164,42 @@ impl TrackStage {
             return;
         };
         let watch = Stopwatch::start();
+        let before = tracker.last_pose();
         tracker.update(news);
+        if let Some((before, after)) = before.zip(tracker.last_pose()) {
+            let step = after * before.inverse();
+            let so_far = self.moved.map_or(step, |moved| {
+                step * Rigid::new(moved.rotation, moved.translation)
+            });
+            self.moved = Some(Similarity {
+                scale: 1.0,
+                rotation: so_far.rotation,
+                translation: so_far.translation,
+            });
+        }
         if !self.is_live {
             tracker.look_again(usize::MAX);
         }
+        self.save_if_due();
         self.secs += watch.secs();
+        if self.is_heard {
+            self.show(news);
+        }
+    }
+
+    /// The depth of the newest keyframe, once.
+    fn show(&mut self, news: &[KeyframeView]) {
+        let newest = news.iter().rev().find(|view| view.depth.width_px > 0);
+        let Some(view) = newest.filter(|view| self.shown < Some(view.keyframe.id)) else {
+            return;
+        };
+        self.shown = Some(view.keyframe.id);
+        self.events.push(LiveEvent::Keyframe(Box::new(SeenKeyframe {
+            stamp: view.keyframe.frame.stamp,
+            image: std::sync::Arc::clone(&view.keyframe.frame.image),
+            intrinsics: view.intrinsics,
+            depth: std::sync::Arc::clone(&view.depth),
+        })));
     }
 
     /// Returns whether there was a frame to look at.
@@ -163,11 +270,19 @@ pub(super) fn tell(heard: Option<&Sender<Heard>>, frame: &Frame) {
     }
 }
 
+fn tell_outside(stage: &mut TrackStage, events: &Sender<LiveEvent>) {
+    for event in stage.take_events() {
+        // Nobody has to listen.
+        drop(events.send(event));
+    }
+}
+
 /// Returns when nothing more is heard and the map has said its last word.
 pub(super) fn run_track(
     mut stage: TrackStage,
     heard: &Receiver<Heard>,
     news: &Receiver<News>,
+    events: &Sender<LiveEvent>,
 ) -> Tracking {
     // Corners are found by parallel loops, which would wait behind the long ones of mapping in the pool that all share.
     // With a pool of its own they run on this thread.
@@ -179,7 +294,7 @@ pub(super) fn run_track(
         tracing::warn!("tracking shares its threads with mapping and may be late: {e}");
     }
     if stage.is_live {
-        run_live(&mut stage, heard, news);
+        run_live(&mut stage, heard, news, events);
     } else {
         while let Some(next) = heard.recv() {
             match next {
@@ -190,18 +305,26 @@ pub(super) fn run_track(
                     }
                 }
             }
+            tell_outside(&mut stage, events);
         }
     }
     while let Some(views) = news.recv() {
         stage.update(&views);
+        tell_outside(&mut stage, events);
     }
     stage.finish(heard.dropped())
 }
 
 /// Frames first; between them news of the map, then a second look at frames that it has reached.
-fn run_live(stage: &mut TrackStage, heard: &Receiver<Heard>, news: &Receiver<News>) {
+fn run_live(
+    stage: &mut TrackStage,
+    heard: &Receiver<Heard>,
+    news: &Receiver<News>,
+    events: &Sender<LiveEvent>,
+) {
     let mut n_since_news = 0;
     loop {
+        tell_outside(stage, events);
         let next = match heard.try_recv() {
             Ok(Some(next)) => Some(next),
             Ok(None) => {

@@ -51,6 +51,7 @@ struct Shape {
 #[derive(Debug)]
 struct Piece {
     first_splat: u32,
+    ids: Vec<u32>,
     data: Vec<u8>,
 }
 
@@ -131,16 +132,19 @@ impl Assembler {
             sh_degree: chunk.sh_degree,
         };
         let n_bytes = chunk.data.len();
+        let n_splats =
+            n_bytes / layout::bytes_per_splat(shape.sh_degree.min(layout::MAX_SH_DEGREE));
         let is_sound = shape.sh_degree <= layout::MAX_SH_DEGREE
             && n_bytes > 0
             && n_bytes <= MAX_MESSAGE_BYTES
             && n_bytes.is_multiple_of(layout::bytes_per_splat(shape.sh_degree))
             && chunk.chunk_ix < shape.n_chunks
             && chunk.first_splat < shape.n_splats
+            && chunk.ids.len() == n_splats
             && crc32c::crc32c(&chunk.data) == chunk.crc32c;
         self.add(
             &identity,
-            is_sound.then_some(n_bytes + KEEP_BYTES),
+            is_sound.then_some(n_bytes + 4 * n_splats + KEEP_BYTES),
             |open| {
                 if !open.takes(&shape) {
                     return Outcome::Rejected;
@@ -152,6 +156,7 @@ impl Assembler {
                     chunk.chunk_ix,
                     Piece {
                         first_splat: chunk.first_splat,
+                        ids: chunk.ids,
                         data: chunk.data,
                     },
                 );
@@ -362,7 +367,9 @@ impl Open {
             sh_degree: shape.sh_degree,
             ..Splats::default()
         };
+        let mut ids: Vec<u32> = Vec::new();
         for piece in self.pieces.values() {
+            ids.extend(&piece.ids);
             if piece.first_splat as usize != splats.len() {
                 return None;
             }
@@ -378,6 +385,7 @@ impl Open {
         let is_whole = splats.len() == shape.n_splats as usize
             && poses.len() == n_keyframes as usize
             && layout::digest(&splats) == shape.map_sha256
+            && ids.is_sorted_by(|a, b| a < b)
             && layout::fault(&splats).is_none();
         is_whole.then(|| Snapshot {
             map_id: self.identity.map_id,
@@ -387,6 +395,7 @@ impl Open {
             scale,
             poses,
             splats: Arc::new(splats),
+            splat_ids: Arc::new(ids),
         })
     }
 }

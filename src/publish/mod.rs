@@ -1,17 +1,33 @@
-//! Snapshots -> messages for other machines.
+//! Snapshots and poses -> messages for other machines.
 //!
-//! `wire` is the only place that knows how a snapshot becomes messages, `assemble` the way back, `type_hash` how
-//! ROS 2 tells message types apart; `zenoh` sends them.
+//! `outbox` makes each message once, from `wire` and its neighbours, and hands it to all faces; `assemble` and `follow`
+//! are the way back. A face carries bytes: `zenoh`, `recording`. `type_hash` is how ROS 2 tells types apart.
 
 use std::path::PathBuf;
 
 use crate::ros::CdrError;
 
+pub mod archive;
 pub mod assemble;
+pub mod correction;
+pub mod delta;
+pub mod face;
+pub mod follow;
+pub mod live;
+pub mod outbox;
+pub mod overview;
+mod recording;
+#[cfg(feature = "ros2")]
+pub mod ros2;
+pub mod service;
+pub mod status;
 pub mod type_hash;
 pub mod wire;
+pub mod world;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
+#[cfg(feature = "zenoh")]
+mod zenoh_names;
 #[cfg(feature = "zenoh")]
 mod zenoh_session;
 
@@ -33,6 +49,11 @@ pub enum PublishError {
     Declare { key: String, reason: String },
     #[error("cannot send {key:?} over zenoh: {reason}")]
     Send { key: String, reason: String },
+    #[cfg(feature = "ros2")]
+    #[error("cannot send {topic:?} over ROS 2: {reason}")]
+    Ros2 { topic: &'static str, reason: String },
+    #[error("cannot record what goes out: {reason}: {}", path.display())]
+    Record { reason: String, path: PathBuf },
     #[error(transparent)]
     Encode(#[from] CdrError),
     #[error(

@@ -32,12 +32,66 @@ const PLAIN_TYPES: [(&str, u32); 14] = [
 const ARRAY_OFFSET: u32 = 48;
 const UNBOUNDED_SEQUENCE_OFFSET: u32 = 144;
 
+const BOUNDED_SEQUENCE_OFFSET: u32 = 96;
+
+const SERVICE_EVENT_INFO: &str = "MSG: service_msgs/ServiceEventInfo\nuint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n";
+const TIME: &str = "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n";
+
 const SECTION_BREAK: &str =
     "================================================================================\n";
 
 /// `RIHS01_` and 64 hexadecimal digits.
 pub fn type_hash<T: Message>() -> String {
-    let json = description_json(T::TYPE_NAME, T::DEFINITION);
+    hash_of(T::TYPE_NAME, T::DEFINITION)
+}
+
+/// The same by name and definition.
+pub fn hash_of(type_name: &str, definition: &str) -> String {
+    hashed(&description_json(type_name, definition))
+}
+
+/// Of a service, whose description refers to its question, its answer and what introspection says of both.
+pub fn service_hash(type_name: &str, request: &str, response: &str) -> String {
+    let bodies = [(request, "Request"), (response, "Response")].map(|(definition, part)| {
+        let (root, rest) = definition
+            .split_once(SECTION_BREAK)
+            .unwrap_or((definition, ""));
+        // Nothing is no structure: rosidl gives it one member.
+        let is_empty = root
+            .lines()
+            .all(|line| line.split('#').next().is_some_and(|l| l.trim().is_empty()));
+        let root = if is_empty {
+            "uint8 structure_needs_at_least_one_member\n"
+        } else {
+            root
+        };
+        (format!("MSG: {type_name}_{part}\n{root}"), rest.to_owned())
+    });
+    let [(request, request_rest), (response, response_rest)] = bodies;
+    let name = type_name;
+    let root = format!(
+        "{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n"
+    );
+    let event = format!(
+        "MSG: {name}_Event\nservice_msgs/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response\n"
+    );
+    let sections: Vec<&str> = [
+        root.as_str(),
+        &request,
+        &response,
+        &event,
+        SERVICE_EVENT_INFO,
+        TIME,
+        &request_rest,
+        &response_rest,
+    ]
+    .into_iter()
+    .filter(|section| !section.is_empty())
+    .collect();
+    hashed(&description_json(type_name, &sections.join(SECTION_BREAK)))
+}
+
+fn hashed(json: &str) -> String {
     Sha256::digest(json.as_bytes())
         .iter()
         .fold("RIHS01_".to_owned(), |mut text, byte| {
@@ -48,10 +102,18 @@ pub fn type_hash<T: Message>() -> String {
 
 /// `geometry_msgs/msg/PoseStamped` -> `geometry_msgs::msg::dds_::PoseStamped_`, as keys spell types.
 pub fn dds_type_name<T: Message>() -> String {
-    let (package, name) = T::TYPE_NAME
-        .split_once("/msg/")
-        .expect("a type name is package/msg/Name");
-    format!("{package}::msg::dds_::{name}_")
+    dds_name(T::TYPE_NAME)
+}
+
+/// The same by name, of services as well.
+pub fn dds_name(type_name: &str) -> String {
+    let (package, rest) = type_name
+        .split_once('/')
+        .expect("a type name is package/kind/Name");
+    let (kind, name) = rest
+        .split_once('/')
+        .expect("a type name is package/kind/Name");
+    format!("{package}::{kind}::dds_::{name}_")
 }
 
 /// The definitions are our own constants: what they lack is our mistake, hence the panics.
@@ -87,8 +149,8 @@ fn type_json(type_name: &str, body: &str, types: &BTreeMap<String, &str>) -> Str
         let (Some(type_text), Some(name)) = (words.next(), words.next()) else {
             continue;
         };
-        // A constant, not a field.
-        if text.contains('=') {
+        // A constant, not a field with a bound.
+        if text.replace("<=", "").contains('=') {
             continue;
         }
         fields.push(format!(
@@ -113,11 +175,13 @@ fn field_type_json(type_text: &str, package: &str, types: &BTreeMap<String, &str
     let (offset, capacity) = match brackets {
         None => (0, 0),
         Some("") => (UNBOUNDED_SEQUENCE_OFFSET, 0),
+        Some(bound) if bound.starts_with("<=") => (
+            BOUNDED_SEQUENCE_OFFSET,
+            bound[2..].parse::<u32>().expect("a bound is a number"),
+        ),
         Some(count) => (
             ARRAY_OFFSET,
-            count
-                .parse::<u32>()
-                .expect("bounded sequences are not in use here"),
+            count.parse::<u32>().expect("a length is a number"),
         ),
     };
     let plain = PLAIN_TYPES.iter().find(|(name, _)| *name == element);
@@ -135,8 +199,11 @@ fn field_type_json(type_text: &str, package: &str, types: &BTreeMap<String, &str
     )
 }
 
-/// `std_msgs/Header` -> `std_msgs/msg/Header`; a bare name belongs to the package that uses it.
+/// `std_msgs/Header` -> `std_msgs/msg/Header`; a bare name belongs to the package that uses it, a full one stays.
 fn full_name(name: &str, package: &str) -> String {
+    if name.matches('/').count() == 2 {
+        return name.to_owned();
+    }
     match name.split_once('/') {
         Some((package, name)) => format!("{package}/msg/{name}"),
         None => format!("{package}/msg/{name}"),

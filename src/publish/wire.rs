@@ -8,12 +8,10 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Intrinsics;
 use crate::map::layout;
 use crate::map::snapshot::{KeyframePose, Snapshot};
-use crate::ros::{self, CdrError, Header, Message, Pose, PoseStamped, Time};
+use crate::ros::{self, CdrError, Header, Message, Pose, Time};
+use crate::splat::Splats;
 // The pieces that definitions end with; each names the next, so all must be in sight.
 use crate::ros::{header_def, pose_def, quaternion_def, separator, time_def, vector_defs};
-
-/// `frame_id` of everything that is given in the map frame.
-pub const MAP_FRAME: &str = "map";
 
 /// No message is larger, whatever the parameters say.
 pub const MAX_MESSAGE_BYTES: usize = 1 << 20;
@@ -34,6 +32,7 @@ pub struct SplatChunk {
     pub n_chunks: u32,
     pub chunk_ix: u32,
     pub first_splat: u32,
+    pub ids: Vec<u32>,
     pub crc32c: u32,
     #[serde(with = "serde_bytes")]
     pub data: Vec<u8>,
@@ -123,35 +122,23 @@ impl Message for KeyframeArray {
 #[derive(Debug)]
 pub struct Messages<'a> {
     snapshot: &'a Snapshot,
+    frame: &'a str,
     map_sha256: [u8; 32],
     splats_per_chunk: usize,
     keyframes_per_array: usize,
 }
 
 impl<'a> Messages<'a> {
-    /// A chunk holds at least one splat, however small `chunk_bytes` is.
-    pub fn new(snapshot: &'a Snapshot, chunk_bytes: usize) -> Self {
+    /// A chunk holds at least one splat, however small `chunk_bytes` is. `frame` is the splats' own.
+    pub fn new(snapshot: &'a Snapshot, frame: &'a str, chunk_bytes: usize) -> Self {
         let chunk_bytes = chunk_bytes.min(MAX_MESSAGE_BYTES / 2);
         Self {
             snapshot,
+            frame,
             map_sha256: layout::digest(&snapshot.splats),
-            splats_per_chunk: (chunk_bytes / layout::bytes_per_splat(snapshot.splats.sh_degree))
-                .max(1),
+            splats_per_chunk: splats_per_message(&snapshot.splats, chunk_bytes),
             keyframes_per_array: (chunk_bytes / KEYFRAME_POSE_BYTES).max(1),
         }
-    }
-
-    /// The newest refined pose; `None` before the first keyframe is placed.
-    pub fn pose(&self) -> Option<PoseStamped> {
-        let newest = self.snapshot.poses.last()?;
-        let header = Header {
-            stamp: newest.stamp.into(),
-            frame_id: MAP_FRAME.to_owned(),
-        };
-        Some(PoseStamped {
-            header,
-            pose: newest.map_from_cam.into(),
-        })
     }
 
     pub fn manifest(&self) -> SplatManifest {
@@ -194,8 +181,13 @@ impl<'a> Messages<'a> {
     }
 
     pub fn chunks(&self) -> impl Iterator<Item = SplatChunk> {
+        self.chunks_from(0, self.n_chunks())
+    }
+
+    /// At most `n` of them.
+    pub fn chunks_from(&self, first: usize, n: usize) -> impl Iterator<Item = SplatChunk> {
         let n_splats = self.snapshot.splats.len();
-        (0..self.n_chunks()).map(move |chunk_ix| {
+        (first..first.saturating_add(n).min(self.n_chunks())).map(move |chunk_ix| {
             let first = chunk_ix * self.splats_per_chunk;
             self.chunk(chunk_ix, first..n_splats.min(first + self.splats_per_chunk))
         })
@@ -204,6 +196,7 @@ impl<'a> Messages<'a> {
     fn chunk(&self, chunk_ix: usize, range: Range<usize>) -> SplatChunk {
         let snapshot = self.snapshot;
         let first_splat = range.start as u32;
+        let ids = snapshot.splat_ids[range.clone()].to_vec();
         let mut data = Vec::new();
         layout::encode(&snapshot.splats, range, &mut data);
         SplatChunk {
@@ -217,6 +210,7 @@ impl<'a> Messages<'a> {
             n_chunks: self.n_chunks() as u32,
             chunk_ix: chunk_ix as u32,
             first_splat,
+            ids,
             crc32c: crc32c::crc32c(&data),
             data,
         }
@@ -229,9 +223,14 @@ impl<'a> Messages<'a> {
     fn header(&self) -> Header {
         Header {
             stamp: self.snapshot.stamp.into(),
-            frame_id: MAP_FRAME.to_owned(),
+            frame_id: self.frame.to_owned(),
         }
     }
+}
+
+/// Splats, and their ids, that fit into so many bytes; at least one.
+pub(super) fn splats_per_message(splats: &Splats, chunk_bytes: usize) -> usize {
+    (chunk_bytes / (layout::bytes_per_splat(splats.sh_degree) + 4)).max(1)
 }
 
 impl From<&KeyframePose> for KeyframePoseMsg {

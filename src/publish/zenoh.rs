@@ -1,14 +1,14 @@
-//! Snapshots -> zenoh, under the keys of rmw_zenoh, so that ROS 2 nodes on that middleware see plain topics.
+//! Posts -> zenoh, under the keys of rmw_zenoh, so that ROS 2 nodes on that middleware see plain topics and services.
 //!
-//! Four topics under `<domain>/<namespace>/`: `pose`, `keyframes`, `splats`, `splats/manifest`. Late joiners `get`
-//! the same keys and receive the newest snapshot. Blocking calls; the caller brings the thread.
+//! Late joiners `get` a topic's key and receive its newest message, or the published map. Blocking calls.
 
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use serde::Serialize;
 use sha2::{Digest, Sha256};
 use zenoh::bytes::ZBytes;
 use zenoh::liveliness::LivelinessToken;
@@ -17,211 +17,190 @@ use zenoh::query::{Query, Queryable};
 use zenoh::{Session, Wait};
 
 use crate::config::PublishParams;
-use crate::map::snapshot::Snapshot;
 use crate::publish::PublishError;
-use crate::publish::type_hash::{dds_type_name, type_hash};
-use crate::publish::wire::{self, KeyframeArray, Messages, SplatChunk, SplatManifest};
+use crate::publish::archive::Archive;
+use crate::publish::face::{Delivery, Face, Post, Topic};
+use crate::publish::service::{Desk, SERVICES, Service};
+use crate::publish::zenoh_names::Names;
 use crate::publish::zenoh_session::open_session;
-use crate::ros::{Message, PoseStamped};
 
 /// `close` waits no longer. zenoh itself lingers ten seconds over bytes that a stalled peer never takes.
 const MAX_CLOSING: Duration = Duration::from_secs(2);
-/// Questions of late joiners that may wait; more are dropped, and their askers see an empty answer.
+/// Questions that may wait; more are dropped, and their askers see an empty answer.
 const MAX_QUESTIONS: usize = 32;
+/// Bytes of an attachment's gid.
+const GID_BYTES: usize = 16;
 
-/// The topics in the order of `Topics`.
-const POSE: usize = 0;
-const KEYFRAMES: usize = 1;
-const SPLATS: usize = 2;
-const MANIFEST: usize = 3;
-
-/// A message ready to go, as often as it is asked for; both parts share their bytes with every copy.
-#[derive(Clone)]
-struct Outgoing {
-    payload: ZBytes,
-    attachment: ZBytes,
-}
-
-/// The newest snapshot, by topic.
-type Outgoings = [Vec<Outgoing>; 4];
-type Latest = Arc<Mutex<Arc<Outgoings>>>;
-
-struct Topic {
+/// How one topic leaves.
+struct Way {
     key: String,
     /// Names this publisher in attachments.
-    gid: [u8; 16],
+    gid: [u8; GID_BYTES],
     /// Number of the last message.
-    sequence: i64,
+    sequence: AtomicI64,
     congestion_control: CongestionControl,
-    queryable: Queryable<()>,
-    /// Lets `ros2 topic list` see the topic.
-    token: LivelinessToken,
 }
 
-impl Topic {
-    fn outgoing<T: Message + Serialize>(
-        &mut self,
-        message: &T,
-        stamp_nanos: i64,
-    ) -> Result<Outgoing, PublishError> {
-        self.sequence += 1;
-        let attachment = attachment(self.sequence, stamp_nanos, self.gid);
-        Ok(Outgoing {
-            payload: ZBytes::from(wire::payload(message)?),
-            attachment: ZBytes::from(attachment),
-        })
+impl Way {
+    fn attachment(&self, stamp_nanos: i64) -> Vec<u8> {
+        let sequence = self.sequence.fetch_add(1, Ordering::Relaxed) + 1;
+        attachment(sequence, stamp_nanos, self.gid)
     }
 }
 
-/// Sends snapshots until it is closed.
-pub struct ZenohPublisher {
-    session: Session,
-    topics: [Topic; 4],
-    node_token: LivelinessToken,
-    latest: Latest,
-    answers: JoinHandle<()>,
-    endpoints: Vec<String>,
-    chunk_bytes: usize,
+/// What has to be taken back at the end.
+struct Declared {
+    tokens: Vec<LivelinessToken>,
+    queryables: Vec<Queryable<()>>,
+    threads: Vec<JoinHandle<()>>,
 }
 
-impl std::fmt::Debug for ZenohPublisher {
+type Ways = Arc<BTreeMap<&'static str, Way>>;
+
+/// Sends and answers until it is closed.
+pub struct ZenohFace {
+    session: Session,
+    ways: Ways,
+    declared: Mutex<Option<Declared>>,
+    endpoints: Vec<String>,
+}
+
+impl std::fmt::Debug for ZenohFace {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("ZenohPublisher")
+        f.debug_struct("ZenohFace")
             .field("endpoints", &self.endpoints)
             .finish_non_exhaustive()
     }
 }
 
-impl ZenohPublisher {
-    /// Opens a session and declares the topics; returns when late joiners can ask.
-    pub fn open(params: &PublishParams) -> Result<Self, PublishError> {
+impl ZenohFace {
+    /// Opens a session and declares topics and services; returns when late joiners can ask.
+    pub fn open(
+        params: &PublishParams,
+        topics: &[&'static Topic],
+        archive: Arc<Archive>,
+        desk: Arc<Desk>,
+    ) -> Result<Self, PublishError> {
         let names = Names::new(params)?;
         let (session, endpoints) = open_session(params)?;
-        let latest = Latest::default();
-        let (questions_tx, questions) = sync_channel(MAX_QUESTIONS);
-        let topics = [
-            names.declare::<PoseStamped>(&session, POSE, CongestionControl::Drop, &questions_tx)?,
-            // A snapshot without its keyframes is incomplete: they travel like chunks.
-            names.declare::<KeyframeArray>(
-                &session,
-                KEYFRAMES,
-                CongestionControl::Block,
-                &questions_tx,
-            )?,
-            names.declare::<SplatChunk>(
-                &session,
-                SPLATS,
-                CongestionControl::Block,
-                &questions_tx,
-            )?,
-            names.declare::<SplatManifest>(
-                &session,
-                MANIFEST,
-                CongestionControl::Block,
-                &questions_tx,
-            )?,
-        ];
-        let node_token = declare_token(&session, names.node_token(&session))?;
-        let keys = topics.each_ref().map(|topic| topic.key.clone());
-        let shared = Arc::clone(&latest);
-        let answers = std::thread::Builder::new()
-            .name("zenoh-answers".to_owned())
-            .spawn(move || answer(&questions, &keys, &shared))
-            .map_err(|e| PublishError::Open {
-                endpoints: endpoints.join(" "),
-                reason: e.to_string(),
-            })?;
+        let (late_tx, late) = sync_channel(MAX_QUESTIONS);
+        let (asked_tx, asked) = sync_channel(MAX_QUESTIONS);
+        let mut declared = Declared {
+            tokens: vec![declare_token(&session, names.node_token(&session))?],
+            queryables: Vec::new(),
+            threads: Vec::new(),
+        };
+        let mut ways = BTreeMap::new();
+        for (ix, topic) in topics.iter().enumerate() {
+            let key = names.topic_key(topic);
+            let token_key = names.topic_token(&session, topic, ix + 1);
+            let gid = Sha256::digest(token_key.as_bytes());
+            let gid = *gid.first_chunk().expect("SHA-256 is longer than a gid");
+            declared
+                .queryables
+                .push(queryable(&session, &key, *topic, &late_tx)?);
+            declared.tokens.push(declare_token(&session, token_key)?);
+            let way = Way {
+                key,
+                gid,
+                sequence: AtomicI64::new(0),
+                congestion_control: match topic.delivery {
+                    Delivery::Newest => CongestionControl::Drop,
+                    // Transforms and diagnostics come again soon, and poses wait behind them.
+                    Delivery::Reliable { .. } if topic.name.starts_with('/') => {
+                        CongestionControl::Drop
+                    }
+                    // A map without one of its pieces is incomplete.
+                    Delivery::Latched { .. } | Delivery::Reliable { .. } => {
+                        CongestionControl::Block
+                    }
+                },
+            };
+            ways.insert(topic.name, way);
+        }
+        for (ix, service) in SERVICES.iter().enumerate() {
+            let key = names.service_key(service);
+            declared
+                .queryables
+                .push(queryable(&session, &key, service, &asked_tx)?);
+            let token_key = names.service_token(&session, service, topics.len() + ix + 1);
+            declared.tokens.push(declare_token(&session, token_key)?);
+        }
+        let ways: Ways = Arc::new(ways);
+        let fault = |e: std::io::Error| PublishError::Open {
+            endpoints: endpoints.join(" "),
+            reason: e.to_string(),
+        };
+        let told = Arc::clone(&ways);
+        let late_thread = named("zenoh-late", move || tell_late(&late, &told, &archive));
+        declared.threads.push(late_thread.map_err(fault)?);
+        let desk_thread = named("zenoh-services", move || serve(&asked, &desk));
+        declared.threads.push(desk_thread.map_err(fault)?);
+        tracing::info!("zenoh listens on {}", endpoints.join(" "));
         Ok(Self {
             session,
-            topics,
-            node_token,
-            latest,
-            answers,
+            ways,
+            declared: Mutex::new(Some(declared)),
             endpoints,
-            chunk_bytes: params.chunk_bytes,
         })
     }
+}
 
-    /// Where peers may connect, for example `tcp/127.0.0.1:40123`; port 0 of the parameter is resolved.
-    pub fn endpoints(&self) -> Vec<String> {
+impl Face for ZenohFace {
+    fn send(&self, post: &Post) -> Result<(), PublishError> {
+        let Some(way) = self.ways.get(post.topic.name) else {
+            return Ok(());
+        };
+        self.session
+            .put(&way.key, ZBytes::from(post.payload.to_vec()))
+            .congestion_control(way.congestion_control)
+            .attachment(way.attachment(post.stamp.nanos))
+            .wait()
+            .map_err(|e| PublishError::Send {
+                key: way.key.clone(),
+                reason: e.to_string(),
+            })
+    }
+
+    fn endpoints(&self) -> Vec<String> {
         self.endpoints.clone()
     }
 
-    /// Sends a whole snapshot; returns when zenoh has taken all of it. Waits for slow peers, for dead ones at most
-    /// two seconds.
-    pub fn publish(&mut self, snapshot: &Arc<Snapshot>) -> Result<(), PublishError> {
-        let outgoings = Arc::new(self.encode(snapshot)?);
-        // Before the first message goes out: who subscribed too late for it finds it here.
-        *self.latest.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(&outgoings);
-        for topic_ix in [POSE, MANIFEST, KEYFRAMES, SPLATS] {
-            let topic = &self.topics[topic_ix];
-            for outgoing in &outgoings[topic_ix] {
-                self.session
-                    .put(&topic.key, outgoing.payload.clone())
-                    .congestion_control(topic.congestion_control)
-                    .attachment(outgoing.attachment.clone())
-                    .wait()
-                    .map_err(|e| PublishError::Send {
-                        key: topic.key.clone(),
-                        reason: e.to_string(),
-                    })?;
-            }
-        }
-        Ok(())
-    }
-
-    fn encode(&mut self, snapshot: &Snapshot) -> Result<Outgoings, PublishError> {
-        let messages = Messages::new(snapshot, self.chunk_bytes);
-        let stamp_nanos = snapshot.stamp.nanos;
-        let [pose, keyframes, splats, manifest] = &mut self.topics;
-        Ok([
-            messages
-                .pose()
-                .map(|message| pose.outgoing(&message, stamp_nanos))
-                .into_iter()
-                .collect::<Result<_, _>>()?,
-            messages
-                .keyframes()
-                .map(|message| keyframes.outgoing(&message, stamp_nanos))
-                .collect::<Result<_, _>>()?,
-            messages
-                .chunks()
-                .map(|message| splats.outgoing(&message, stamp_nanos))
-                .collect::<Result<_, _>>()?,
-            vec![manifest.outgoing(&messages.manifest(), stamp_nanos)?],
-        ])
-    }
-
     /// Says goodbye to peers. Waits at most two seconds; what still hangs then is left to its threads.
-    pub fn close(self) -> Result<(), PublishError> {
+    fn close(&self) -> Result<(), PublishError> {
+        let declared = self
+            .declared
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        let Some(declared) = declared else {
+            return Ok(());
+        };
         let (done_tx, done) = sync_channel(1);
-        let Self {
-            session,
-            topics,
-            node_token,
-            answers,
-            ..
-        } = self;
-        let closing = std::thread::Builder::new()
-            .name("zenoh-close".to_owned())
-            .spawn(move || {
-                for topic in topics {
-                    undeclare(topic.token);
-                    // Drops the sender of questions; with the last one `answers` ends.
-                    if let Err(e) = topic.queryable.undeclare().wait() {
-                        tracing::debug!("zenoh queryable {:?} did not undeclare: {e}", topic.key);
-                    }
+        let session = self.session.clone();
+        let closing = named("zenoh-close", move || {
+            // Each drops a sender of questions; with the last one their threads end.
+            for queryable in declared.queryables {
+                if let Err(e) = queryable.undeclare().wait() {
+                    tracing::debug!("a zenoh queryable did not undeclare: {e}");
                 }
-                undeclare(node_token);
-                if let Err(e) = session.close().wait() {
-                    tracing::debug!("zenoh session did not close: {e}");
+            }
+            for token in declared.tokens {
+                if let Err(e) = token.undeclare().wait() {
+                    tracing::debug!("a zenoh liveliness token did not undeclare: {e}");
                 }
-                if answers.join().is_err() {
-                    tracing::warn!("the thread that answers late joiners panicked");
+            }
+            if let Err(e) = session.close().wait() {
+                tracing::debug!("zenoh session did not close: {e}");
+            }
+            for thread in declared.threads {
+                if thread.join().is_err() {
+                    tracing::warn!("a thread that answers over zenoh panicked");
                 }
-                // Nobody waits any more when this fails.
-                done_tx.send(()).unwrap_or(());
-            });
+            }
+            // Nobody waits any more when this fails.
+            done_tx.send(()).unwrap_or(());
+        });
         let is_done = closing.is_ok() && done.recv_timeout(MAX_CLOSING).is_ok();
         if is_done {
             Ok(())
@@ -233,111 +212,33 @@ impl ZenohPublisher {
     }
 }
 
-/// How keys are spelled for one run.
-struct Names {
-    domain_id: u32,
-    /// `a/b`, or empty.
-    namespace: String,
+fn named(name: &str, body: impl FnOnce() + Send + 'static) -> std::io::Result<JoinHandle<()>> {
+    std::thread::Builder::new()
+        .name(name.to_owned())
+        .spawn(body)
 }
 
-impl Names {
-    const TOPICS: [&str; 4] = ["pose", "keyframes", "splats", "splats/manifest"];
-
-    fn new(params: &PublishParams) -> Result<Self, PublishError> {
-        let namespace = params.namespace.trim_matches('/').to_owned();
-        let is_name = |part: &str| {
-            part.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
-                && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-        };
-        if !namespace.split('/').all(is_name) {
-            return Err(PublishError::Param {
-                name: "namespace",
-                found: params.namespace.clone(),
-                expected: "letters, digits and underscores, parts joined by /".to_owned(),
-            });
-        }
-        Ok(Self {
-            domain_id: params.domain_id,
-            namespace,
+/// Questions go to a thread that may take its time.
+fn queryable<T: Sync + 'static>(
+    session: &Session,
+    key: &str,
+    about: &'static T,
+    questions: &SyncSender<(&'static T, Query)>,
+) -> Result<Queryable<()>, PublishError> {
+    let questions = questions.clone();
+    session
+        .declare_queryable(key)
+        .callback(move |query| match questions.try_send((about, query)) {
+            Ok(()) | Err(TrySendError::Disconnected(_)) => {}
+            Err(TrySendError::Full(_)) => {
+                tracing::debug!("a question was turned away: {MAX_QUESTIONS} wait");
+            }
         })
-    }
-
-    fn key<T: Message>(&self, topic: &str) -> String {
-        format!(
-            "{}/{}/{topic}/{}/{}",
-            self.domain_id,
-            self.namespace,
-            dds_type_name::<T>(),
-            type_hash::<T>()
-        )
-    }
-
-    /// The node is the last part of the namespace, the rest is the node's namespace; `%` stands for `/`.
-    fn node(&self) -> String {
-        match self.namespace.rsplit_once('/') {
-            Some((parent, node)) => format!("%/%{}/{node}", parent.replace('/', "%")),
-            None => format!("%/%/{}", self.namespace),
-        }
-    }
-
-    fn node_token(&self, session: &Session) -> String {
-        format!(
-            "@ros2_lv/{}/{}/0/0/NN/{}",
-            self.domain_id,
-            session.zid(),
-            self.node()
-        )
-    }
-
-    /// `::,10:,:,:,,` stands for reliable, volatile, the last ten.
-    fn topic_token<T: Message>(&self, session: &Session, topic_ix: usize) -> String {
-        format!(
-            "@ros2_lv/{}/{}/0/{}/MP/{}/%{}/{}/{}/::,10:,:,:,,",
-            self.domain_id,
-            session.zid(),
-            topic_ix + 1,
-            self.node(),
-            format!("{}/{}", self.namespace, Self::TOPICS[topic_ix]).replace('/', "%"),
-            dds_type_name::<T>(),
-            type_hash::<T>(),
-        )
-    }
-
-    fn declare<T: Message>(
-        &self,
-        session: &Session,
-        topic_ix: usize,
-        congestion_control: CongestionControl,
-        questions: &SyncSender<(usize, Query)>,
-    ) -> Result<Topic, PublishError> {
-        let key = self.key::<T>(Self::TOPICS[topic_ix]);
-        let token_key = self.topic_token::<T>(session, topic_ix);
-        let gid = Sha256::digest(token_key.as_bytes());
-        let questions = questions.clone();
-        let queryable = session
-            .declare_queryable(&key)
-            .callback(move |query| match questions.try_send((topic_ix, query)) {
-                Ok(()) | Err(TrySendError::Disconnected(_)) => {}
-                Err(TrySendError::Full(_)) => {
-                    tracing::debug!("a late joiner was turned away: {MAX_QUESTIONS} wait");
-                }
-            })
-            .wait()
-            .map_err(|e| PublishError::Declare {
-                key: key.clone(),
-                reason: e.to_string(),
-            })?;
-        let token = declare_token(session, token_key)?;
-        let gid = *gid.first_chunk().expect("SHA-256 is longer than a gid");
-        Ok(Topic {
-            key,
-            gid,
-            sequence: 0,
-            congestion_control,
-            queryable,
-            token,
+        .wait()
+        .map_err(|e| PublishError::Declare {
+            key: key.to_owned(),
+            reason: e.to_string(),
         })
-    }
 }
 
 fn declare_token(session: &Session, key: String) -> Result<LivelinessToken, PublishError> {
@@ -348,33 +249,61 @@ fn declare_token(session: &Session, key: String) -> Result<LivelinessToken, Publ
     })
 }
 
-fn undeclare(token: LivelinessToken) {
-    if let Err(e) = token.undeclare().wait() {
-        tracing::debug!("zenoh liveliness token did not undeclare: {e}");
-    }
-}
-
 /// Runs until the last queryable is gone. One question at a time, so a late joiner costs others nothing but time.
-fn answer(questions: &Receiver<(usize, Query)>, keys: &[String; 4], latest: &Latest) {
-    while let Ok((topic_ix, query)) = questions.recv() {
-        let outgoings = Arc::clone(&latest.lock().unwrap_or_else(PoisonError::into_inner));
-        for outgoing in &outgoings[topic_ix] {
-            let reply = query.reply(&keys[topic_ix], outgoing.payload.clone());
-            if let Err(e) = reply.attachment(outgoing.attachment.clone()).wait() {
-                tracing::debug!("a late joiner left before its answer: {e}");
-                break;
-            }
+fn tell_late(questions: &Receiver<(&'static Topic, Query)>, ways: &Ways, archive: &Archive) {
+    while let Ok((topic, query)) = questions.recv() {
+        let Some(way) = ways.get(topic.name) else {
+            continue;
+        };
+        let told = archive.tell(topic, &mut |post| {
+            query
+                .reply(&way.key, ZBytes::from(post.payload.to_vec()))
+                .attachment(way.attachment(post.stamp.nanos))
+                .wait()
+                .map_err(|e| PublishError::Send {
+                    key: way.key.clone(),
+                    reason: e.to_string(),
+                })
+        });
+        if let Err(e) = told {
+            tracing::debug!("a late joiner left before its answer: {e}");
         }
     }
 }
 
+/// Runs until the last queryable is gone.
+fn serve(questions: &Receiver<(&'static Service, Query)>, desk: &Desk) {
+    while let Ok((service, query)) = questions.recv() {
+        // Who looks around with a wildcard must not reset the map.
+        let is_for_us = !query.key_expr().is_wild();
+        let Some(question) = query.payload().filter(|_| is_for_us).map(ZBytes::to_bytes) else {
+            continue;
+        };
+        let answer = desk.answer(service.kind, &question);
+        // The asker knows its question by number and gid.
+        let (sequence, gid) = query
+            .attachment()
+            .and_then(|bytes| asker_of(&bytes.to_bytes()))
+            .unwrap_or_default();
+        let reply = query.reply(query.key_expr().clone(), answer);
+        if let Err(e) = reply.attachment(attachment(sequence, 0, gid)).wait() {
+            tracing::debug!("an asker of {} left before its answer: {e}", service.name);
+        }
+    }
+}
+
+fn asker_of(attachment: &[u8]) -> Option<(i64, [u8; GID_BYTES])> {
+    let sequence = i64::from_le_bytes(*attachment.first_chunk()?);
+    Some((sequence, *attachment.get(17..)?.first_chunk()?))
+}
+
 /// What rmw_zenoh expects beside the payload: sequence number, source time, length and bytes of the gid. The source
 /// time is the data's stamp, so that a replay sends the same bytes each time.
-fn attachment(sequence: i64, stamp_nanos: i64, gid: [u8; 16]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(33);
+fn attachment(sequence: i64, stamp_nanos: i64, gid: [u8; GID_BYTES]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(17 + GID_BYTES);
     bytes.extend_from_slice(&sequence.to_le_bytes());
     bytes.extend_from_slice(&stamp_nanos.to_le_bytes());
-    bytes.push(gid.len() as u8);
+    bytes.push(GID_BYTES as u8);
     bytes.extend_from_slice(&gid);
     bytes
 }

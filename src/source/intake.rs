@@ -104,6 +104,12 @@ impl Intake {
         self.counts.interruptions += 1;
     }
 
+    /// Time begins anew: the next picture may have any stamp.
+    #[cfg(feature = "ros2")]
+    pub fn begin_anew(&mut self) {
+        self.last_stamp = None;
+    }
+
     /// Counts a picture and says whether it is worth decoding: its stamp must be later than the last frame's.
     pub fn arrive(&mut self, stamp: Stamp) -> Option<Arrival> {
         let seq = self.counts.received;

@@ -236,6 +236,14 @@ fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
     queue.iter().map(|waiting| waiting.payload.len()).sum()
 }
 
+/// For sources whose pictures come as messages, too.
+#[cfg(feature = "ros2")]
+pub(super) fn picture_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
+    let mut out = super::decode::empty();
+    decode_into(payload, is_compressed, &mut Jpeg::default(), &mut out)?;
+    Ok(out)
+}
+
 fn decode_into(
     payload: &[u8],
     is_compressed: bool,
@@ -250,7 +258,7 @@ fn decode_into(
     super::decode::raw_into(&message, out).map_err(|e| e.to_string())
 }
 
-fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
+pub(super) fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
     let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
     super::decode::depth(&message).map_err(|e| e.to_string())
 }

@@ -14,6 +14,7 @@ pub mod mcap;
 pub mod pixels;
 pub mod recording;
 pub mod rectify;
+pub mod ros2;
 pub mod scene_formats;
 pub mod synthetic;
 #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
@@ -33,9 +34,11 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use crate::config::SourceParams;
 use crate::frame::Frame;
+use crate::pose::Rigid;
 use crate::source::camera::CameraError;
 use crate::source::camera::live::Opener;
 
@@ -47,7 +50,7 @@ pub struct SourceCounts {
     pub undecodable: u64,
     /// Stamps that did not increase; such frames are left out.
     pub out_of_order: u64,
-    /// Pictures that a camera made and that never came: the driver skipped their numbers.
+    /// Made and never looked at: the driver skipped their numbers, or they came faster than they were taken.
     pub dropped: u64,
     /// Times that a camera stopped and was opened again.
     pub interruptions: u64,
@@ -65,7 +68,7 @@ pub enum SourceError {
         path: PathBuf,
     },
     #[error(
-        "{uri:?} is no source URI; expected v4l2:/dev/video0, webcam:0, mcap:PATH, images:DIR, synthetic:SCENE or the path of a recording or folder"
+        "{uri:?} is no source URI; expected v4l2:/dev/video0, webcam:0, mcap:PATH, images:DIR, synthetic:SCENE, ros2:/TOPIC or the path of a recording or folder"
     )]
     Uri { uri: String },
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
@@ -80,12 +83,45 @@ pub enum SourceError {
     NotInBuild { uri: String, way_out: &'static str },
     #[error(transparent)]
     Camera(#[from] CameraError),
+    #[cfg(feature = "ros2")]
+    #[error("cannot subscribe to {topic:?}: {reason}")]
+    Subscribe { topic: String, reason: String },
+}
+
+/// What a look for the next frame found.
+#[derive(Debug)]
+pub enum Polled {
+    Frame(Box<Frame>),
+    /// None yet; more may come.
+    Waiting,
+    Ended,
 }
 
 /// Hands out frames one at a time.
 pub trait Source: Send {
     /// The next frame; `None` at the end of the input. A fault in the middle ends the input and stands in `counts`.
     fn next(&mut self) -> Option<Frame>;
+
+    /// The next frame, if one comes within `patience`. Sources that wait for the world override it.
+    fn poll(&mut self, _patience: Duration) -> Polled {
+        self.next()
+            .map_or(Polled::Ended, |frame| Polled::Frame(Box::new(frame)))
+    }
+
+    /// How the camera is mounted on the robot, `base_from_cam` in metres, where the input says so.
+    fn mount(&self) -> Option<Rigid> {
+        None
+    }
+
+    /// Name of the camera's frame, optical axes; empty where the input names none.
+    fn camera_frame(&self) -> &str {
+        ""
+    }
+
+    /// What keeps pictures from coming, a line each.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     fn counts(&self) -> SourceCounts;
 
@@ -155,7 +191,13 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params, seed),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
-        Some(("ros2" | "zenoh", _)) => not_in_build(
+        #[cfg(feature = "ros2")]
+        Some(("ros2", topic)) => Ok(Box::new(ros2::subscriber::Ros2Source::open(topic, params)?)),
+        #[cfg(not(feature = "ros2"))]
+        Some(("ros2", _)) => not_in_build(
+            "build where ROS 2 is sourced, with --features ros2 (docs/ROS2.md), or record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
+        ),
+        Some(("zenoh", _)) => not_in_build(
             "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
         ),
         _ => open_path(uri, params, seed),
@@ -179,6 +221,9 @@ fn open_synthetic(
     params: &SourceParams,
     seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
+    if scene.split('?').next() == Some("endless") {
+        return Ok(Box::new(synthetic::endless::EndlessSource::open(scene)?));
+    }
     Ok(Box::new(synthetic::SyntheticSource::open(
         scene, params, seed,
     )?))

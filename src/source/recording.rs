@@ -8,6 +8,7 @@ mod file;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
 
 use crate::camera::{Distortion, Lens};
 use crate::clock::{Stamp, Stopwatch};
@@ -22,10 +23,12 @@ use crate::source::decode::empty;
 use crate::source::jpeg::Jpeg;
 use crate::source::pixels::{PixelFormat, YuvColour};
 use crate::source::recording::file::Files;
-use crate::source::{Source, SourceError, camera_info as calibration, camera_opener};
+use crate::source::{Polled, Source, SourceError, camera_info as calibration, camera_opener};
 
 /// Pictures between the camera and the disk.
 const PICTURES: usize = 16;
+/// How often Ctrl-C is looked for while a source waits for the world.
+const PATIENCE: Duration = Duration::from_millis(100);
 /// Seconds between two words on the progress.
 const WORD_SECS: f64 = 1.0;
 
@@ -280,12 +283,14 @@ fn from_frames(
 ) {
     let mut first = None;
     while !asked.load(Ordering::Relaxed) {
-        let frame = source.next();
+        let polled = source.poll(PATIENCE);
         let counts = source.counts();
         progress.n_damaged = counts.undecodable;
         progress.n_dropped = counts.dropped;
-        let Some(frame) = frame else {
-            return;
+        let frame = match polled {
+            Polled::Frame(frame) => frame,
+            Polled::Waiting => continue,
+            Polled::Ended => return,
         };
         let first = *first.get_or_insert(frame.stamp);
         if frame.stamp.secs_since(first) > duration_secs {

@@ -224,3 +224,18 @@ pub(super) fn header_stamp(payload: &[u8], log_nanos: i64) -> Option<Stamp> {
         stamp
     })
 }
+
+/// Frame of a message that begins with a header, without decoding the rest.
+#[cfg(feature = "ros2")]
+pub(super) fn header_frame(payload: &[u8]) -> Option<String> {
+    let (&[_, endian, _, _], rest) = payload.split_first_chunk::<4>()?;
+    let (&length, rest) = rest.get(8..)?.split_first_chunk::<4>()?;
+    let length = match endian {
+        0 => u32::from_be_bytes(length),
+        1 => u32::from_le_bytes(length),
+        _ => return None,
+    };
+    // The text ends with a zero, which counts.
+    let text = rest.get(..(length as usize).checked_sub(1)?)?;
+    String::from_utf8(text.to_vec()).ok()
+}

@@ -55,7 +55,7 @@ fn is_candidate(name: &str, topic: &Topic, params: &SourceParams) -> bool {
 }
 
 /// `/camera/image_raw/compressed` and `/camera/image_raw` have `/camera/camera_info` beside them.
-fn info_beside(image_topic: &str) -> String {
+pub(super) fn info_beside(image_topic: &str) -> String {
     let base = image_topic
         .strip_suffix("/compressed")
         .unwrap_or(image_topic);
@@ -114,7 +114,7 @@ pub(super) fn lens_of(survey: &Survey, image_topic: &str, params: &SourceParams)
 }
 
 /// image_proc publishes undistorted pictures as `image_rect` and `image_rect_color` beside the CameraInfo of the raw ones.
-fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
+pub(super) fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
     let base = image_topic
         .strip_suffix("/compressed")
         .unwrap_or(image_topic);

@@ -74,6 +74,11 @@ impl Track {
         self.by_nanos.is_empty()
     }
 
+    #[cfg(feature = "ros2")]
+    pub(super) fn forget_before(&mut self, stamp: Stamp) {
+        self.by_nanos = self.by_nanos.split_off(&stamp.nanos);
+    }
+
     /// Largest distance between two positions.
     pub(super) fn extent(&self) -> Option<f64> {
         let positions: Vec<_> = self.by_nanos.values().map(|p| p.translation).collect();
@@ -132,10 +137,7 @@ impl Odometry {
             Self::Transforms {
                 transforms,
                 camera_frame,
-            } => {
-                let chain = transforms.chain(camera_frame, ODOM_FRAME)?;
-                Transforms::along(&chain, |track| track.between(stamp))
-            }
+            } => transforms.moving(ODOM_FRAME, camera_frame, stamp),
         }
     }
 }
@@ -227,6 +229,33 @@ impl Transforms {
             top_from_child = parent_from_child? * top_from_child;
         }
         Some(top_from_child)
+    }
+
+    /// `parent_from_child` at a time between messages.
+    pub(super) fn moving(&self, parent: &str, child: &str, stamp: Stamp) -> Option<Rigid> {
+        let chain = self.chain(child, parent)?;
+        Self::along(&chain, |track| track.between(stamp))
+    }
+
+    /// Live input goes on for ever: what moves is kept from `stamp` on, what is fixed as it was told last.
+    #[cfg(feature = "ros2")]
+    pub(super) fn forget_before(&mut self, stamp: Stamp) {
+        for link in self.links.values_mut() {
+            let from = match link.track.by_nanos.last_key_value() {
+                Some((newest, _)) if link.is_static => *newest,
+                _ => stamp.nanos,
+            };
+            link.track.forget_before(Stamp::from_nanos(from));
+        }
+        self.links.retain(|_, link| !link.track.is_empty());
+        let lengths = self.links.values().map(|link| link.track.by_nanos.len());
+        self.n_transforms = lengths.sum();
+    }
+
+    /// Whether a frame is above another.
+    #[cfg(feature = "ros2")]
+    pub(super) fn reaches(&self, child: &str, parent: &str) -> bool {
+        self.chain(child, parent).is_some()
     }
 
     /// Whether odometry's frame is above the camera's.

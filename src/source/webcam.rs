@@ -12,7 +12,7 @@ use nokhwa::utils::{
 
 use crate::clock::{Stamp, monotonic_nanos};
 use crate::config::{CameraParams, SourceParams};
-use crate::queue::{Ended, Receiver, Sender, WhenFull, queue};
+use crate::queue::{Received, Receiver, Sender, WhenFull, queue};
 use crate::source::SourceError;
 use crate::source::camera::live::Opener;
 use crate::source::camera::modes::{FORMATS, Offer, names, ranked};
@@ -81,16 +81,16 @@ fn open(
         is_done.store(false, Ordering::Release);
     });
     started.map_err(|e| fail(e.to_string()))?;
-    match news.recv_within(OPEN_WITHIN) {
-        Ok(Some(News::Open(layout))) => Ok(Box::new(Webcam {
+    match news.recv_timeout(OPEN_WITHIN) {
+        Received::Item(News::Open(layout)) => Ok(Box::new(Webcam {
             name: name.to_owned(),
             layout,
             news,
             bytes: Vec::new(),
         })),
-        Ok(Some(News::Failed(reason))) => Err(fail(reason)),
-        Ok(_) => Err(fail("its driver does not answer".to_owned())),
-        Err(Ended) => Err(fail("its thread ended".to_owned())),
+        Received::Item(News::Failed(reason)) => Err(fail(reason)),
+        Received::Item(_) | Received::Nothing => Err(fail("its driver does not answer".to_owned())),
+        Received::Ended => Err(fail("its thread ended".to_owned())),
     }
 }
 
@@ -189,12 +189,12 @@ impl Camera for Webcam {
             reason,
             path: self.name.as_str().into(),
         };
-        match self.news.recv_within(wait) {
-            Ok(Some(News::Picture {
+        match self.news.recv_timeout(wait) {
+            Received::Item(News::Picture {
                 bytes,
                 sequence,
                 arrived,
-            })) => {
+            }) => {
                 self.bytes = bytes;
                 Ok(Some(Shot {
                     bytes: &self.bytes,
@@ -204,9 +204,9 @@ impl Camera for Webcam {
                     now: arrived,
                 }))
             }
-            Ok(Some(News::Failed(reason))) => Err(gone(reason)),
-            Ok(Some(News::Open(_)) | None) => Ok(None),
-            Err(Ended) => Err(gone("its thread ended".to_owned())),
+            Received::Item(News::Failed(reason)) => Err(gone(reason)),
+            Received::Item(News::Open(_)) | Received::Nothing => Ok(None),
+            Received::Ended => Err(gone("its thread ended".to_owned())),
         }
     }
 

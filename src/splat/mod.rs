@@ -34,7 +34,7 @@ pub struct Splats {
     pub anchors: Vec<u32>,
 }
 
-/// A picture to train on. Index in the engine = order of `add_view`.
+/// A picture to train on, or a hollow one, which no step may have. Index in the engine = order of `add_view`.
 #[derive(Debug, Clone)]
 pub struct TrainingView {
     pub image: Arc<RgbImage>,
@@ -195,8 +195,11 @@ pub trait Engine: Send {
     /// Begins with a fresh network; what the old one did to the poses stays in them.
     fn start_refiner(&mut self, settings: &RefinerSettings);
 
-    /// Replaces a view's picture by one of the same size, and its intrinsics.
+    /// Replaces a view's picture, and its intrinsics. A mask of another size must have gone before.
     fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics);
+
+    /// Lets go of a view's picture, depth, mask and matches; where it stands stays. No step until it has a picture again.
+    fn rest_view(&mut self, _view_ix: usize) {}
 
     /// Replaces the depth that guides a view's depth loss.
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>);
@@ -233,6 +236,24 @@ pub trait Engine: Send {
     /// Most bytes that the buffers on a GPU have held; 0 on the CPU.
     fn peak_gpu_bytes(&self) -> u64;
 
+    /// Bytes that it holds: splats, optimiser state and views; on a GPU those of all buffers there.
+    fn held_bytes(&self) -> u64 {
+        0
+    }
+
+    /// Splats that there may be in all without `held_bytes` passing `max_bytes`, not even while rows are moved.
+    fn room_within(&self, _max_bytes: u64) -> usize {
+        usize::MAX
+    }
+
+    /// Waits for all steps and reads how many updates each splat has had: what admits the bands of its colour.
+    fn ages(&mut self) -> Vec<u16> {
+        vec![0; self.n_splats()]
+    }
+
+    /// Gives splats from `first` on the ages that they had in an earlier run.
+    fn set_ages(&mut self, _first: usize, _ages: &[u16]) {}
+
     /// Waits for all steps and reads the splats back.
     fn splats(&mut self) -> Splats;
 
@@ -260,10 +281,9 @@ impl TrainingView {
             "a view's intrinsics are those of its image"
         );
         let n_pixels = size.0 as usize * size.1 as usize;
-        assert_eq!(
-            image.pixels.len(),
-            3 * n_pixels,
-            "an image is as large as it says"
+        assert!(
+            image.is_hollow() || image.pixels.len() == 3 * n_pixels,
+            "an image is as large as it says, or its pixels are elsewhere"
         );
         let is_fit = self.mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
         assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");
@@ -307,24 +327,29 @@ impl Splats {
         self.sh.truncate(n * stride);
     }
 
+    /// Appends splat `i` of others of the same SH degree.
+    pub fn push(&mut self, others: &Self, i: usize) {
+        let stride = self.sh_stride();
+        self.means.push(others.means[i]);
+        self.log_scales.push(others.log_scales[i]);
+        self.quats.push(others.quats[i]);
+        self.opacity_logits.push(others.opacity_logits[i]);
+        self.anchors.push(others.anchors[i]);
+        self.sh
+            .extend_from_slice(&others.sh[i * stride..(i + 1) * stride]);
+    }
+
     /// Only splats whose every number is finite: clients and viewers rely on it.
     pub fn into_finite(self) -> Self {
         if (0..self.len()).all(|i| self.is_finite(i)) {
             return self;
         }
-        let stride = self.sh_stride();
         let mut kept = Self {
             sh_degree: self.sh_degree,
             ..Self::default()
         };
         for i in (0..self.len()).filter(|i| self.is_finite(*i)) {
-            kept.means.push(self.means[i]);
-            kept.log_scales.push(self.log_scales[i]);
-            kept.quats.push(self.quats[i]);
-            kept.opacity_logits.push(self.opacity_logits[i]);
-            kept.anchors.push(self.anchors[i]);
-            kept.sh
-                .extend_from_slice(&self.sh[i * stride..(i + 1) * stride]);
+            kept.push(&self, i);
         }
         kept
     }

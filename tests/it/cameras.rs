@@ -241,8 +241,10 @@ fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
             params,
             is_live: false,
             stop: Stop::default(),
+            out: None,
+            outbox: None,
         };
-        let outcome = pipeline::run(job, None, &mut |_| {}).unwrap();
+        let outcome = pipeline::run(job, &mut |_| {}).unwrap();
         let stamps: Vec<Stamp> = outcome
             .snapshot
             .poses

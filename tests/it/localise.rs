@@ -22,7 +22,7 @@ fn params() -> Params {
     Settings::shipped().params().unwrap()
 }
 
-fn run(args: &[&str]) -> std::process::Output {
+pub fn run(args: &[&str]) -> std::process::Output {
     Command::new(env!("CARGO_BIN_EXE_splat-mapper"))
         .args(args)
         .output()

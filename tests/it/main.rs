@@ -8,9 +8,13 @@
 mod alignment;
 mod backends;
 mod bags;
+mod budgets;
 mod camera_script;
 mod cameras;
+mod continued;
+mod crash;
 mod declared_lengths;
+mod deltas;
 mod engine;
 mod eval;
 mod eval_lines;

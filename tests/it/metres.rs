@@ -1,7 +1,6 @@
 //! Metres of a map that knows none, by odometry, depth pictures, a measured distance.
 
 use std::path::Path;
-use std::process::Command;
 
 use splat_mapper::config::Settings;
 use splat_mapper::config::SourceParams;
@@ -27,10 +26,7 @@ fn take() -> SynthSettings {
 /// (what a replay reports of scale, metres of one unit by the true poses).
 fn replayed(bag: &Path, out: &Path, sets: &[&str]) -> (serde_json::Value, f64) {
     let run = |args: &[&str]| {
-        let output = Command::new(env!("CARGO_BIN_EXE_splat-mapper"))
-            .args(args)
-            .output()
-            .unwrap();
+        let output = crate::localise::run(args);
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert!(output.status.success(), "{args:?}: {said}");
         String::from_utf8(output.stdout).unwrap()

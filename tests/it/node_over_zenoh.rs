@@ -51,6 +51,7 @@ fn early_and_late_subscribers_get_the_map_of_the_run_directory() {
             "--set",
             "publish.linger_secs=120",
         ])
+        .args(["--set", "publish.full_secs=0"])
         .args(["--set", &format!("publish.zenoh_listen={node_end}")])
         .args(["--set", &format!("publish.zenoh_connect={early_end}")])
         .stdout(Stdio::null())

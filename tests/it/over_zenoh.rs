@@ -13,9 +13,11 @@ use splat_mapper::export::ply;
 use splat_mapper::map::snapshot::Snapshot;
 use splat_mapper::publish::PublishError;
 use splat_mapper::publish::assemble::Assembler;
+use splat_mapper::publish::outbox::Outbox;
 use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::publish::zenoh::ZenohPublisher;
-use splat_mapper::ros::{self, PoseStamped};
+use splat_mapper::publish::wire::{KeyframeArray, SplatChunk, SplatManifest};
+use splat_mapper::publish::world;
+use splat_mapper::ros::{self, standard::Path};
 use zenoh::query::ConsolidationMode;
 use zenoh::sample::Sample;
 use zenoh::{Config, Session, Wait};
@@ -30,6 +32,8 @@ pub const PATIENCE: Duration = Duration::from_secs(20);
 fn params(listen: &str) -> PublishParams {
     let mut params = Settings::shipped().params().unwrap().publish;
     params.scouting = false;
+    params.zenoh = true;
+    params.full_secs = 0.0;
     params.zenoh_listen = listen.to_owned();
     params
 }
@@ -56,7 +60,10 @@ pub fn client(listen: &str, connect: &str) -> Session {
 
 pub fn take(assembler: &mut Assembler, sample: &Sample) -> Option<Snapshot> {
     let dds_type = sample.key_expr().as_str().rsplit('/').nth(1).unwrap();
-    if dds_type == dds_type_name::<PoseStamped>() {
+    let is_of_map = dds_type == dds_type_name::<SplatChunk>()
+        || dds_type == dds_type_name::<SplatManifest>()
+        || dds_type == dds_type_name::<KeyframeArray>();
+    if !is_of_map {
         return None;
     }
     assembler.add_payload(dds_type, &sample.payload().to_bytes())
@@ -92,7 +99,7 @@ pub fn free_endpoint() -> String {
 
 #[test]
 fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
-    let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
     let endpoints = publisher.endpoints();
     assert!(
         endpoints.len() == 1 && !endpoints[0].ends_with(":0"),
@@ -116,14 +123,16 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
     ply::write(&received.splats, &paths[1]).unwrap();
     assert!(std::fs::read(&paths[0]).unwrap() == std::fs::read(&paths[1]).unwrap());
 
-    // The pose alone, by its own key.
-    let replies = session.get("0/splat_mapper/pose/*/*").wait().unwrap();
-    let poses: Vec<PoseStamped> = replies
+    // The path alone, by its own key: in a robot's axes.
+    let replies = session.get("0/splat_mapper/path/*/*").wait().unwrap();
+    let paths: Vec<Path> = replies
         .into_iter()
         .map(|r| ros::decode(&r.into_result().unwrap().payload().to_bytes()).unwrap())
         .collect();
-    assert_eq!(poses.len(), 1);
-    assert_eq!(poses[0].pose, snapshot.poses[6].map_from_cam.into());
+    assert_eq!((paths.len(), paths[0].poses.len()), (1, 7));
+    let last = world::ahead() * snapshot.poses[6].map_from_cam;
+    let told = paths[0].poses[6].pose.to_rigid().unwrap();
+    assert!((told.translation - last.translation).length() < 1e-9 && told.angle_to(&last) < 1e-9);
     publisher.close().unwrap();
 }
 
@@ -139,7 +148,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
     params.zenoh_connect = endpoint;
     params.namespace = "robot/mapper".to_owned();
     params.domain_id = 7;
-    let mut publisher = ZenohPublisher::open(&params).unwrap();
+    let publisher = Outbox::open(&params).unwrap();
     assert!(publisher.endpoints().is_empty());
     // Publishing begins when the peers know each other.
     let matching = session
@@ -148,7 +157,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
         .history(true)
         .wait()
         .unwrap();
-    let tokens: Vec<String> = (0..5)
+    let tokens: Vec<String> = (0..23)
         .map(|_| {
             matching
                 .recv_timeout(PATIENCE)
@@ -189,7 +198,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
 
 #[test]
 fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
-    let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
     let session = client("", &publisher.endpoints()[0]);
     let snapshot = Arc::new(random_snapshot(2000, 3, 1, 2));
     publisher.publish(&snapshot).unwrap();
@@ -252,7 +261,7 @@ impl Wire {
 
 #[test]
 fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
-    let mut publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
     let endpoint = publisher.endpoints().remove(0);
     // 18 MB each: more than all buffers on the way hold.
     let snapshot = |revision| Arc::new(random_snapshot(60_000, 3, 3, revision));
@@ -308,7 +317,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let mut params = params("");
     params.zenoh_connect = endpoint.clone();
     let started = Stopwatch::start();
-    let mut publisher = ZenohPublisher::open(&params).unwrap();
+    let publisher = Outbox::open(&params).unwrap();
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
     publisher.publish(&snapshot).unwrap();
     assert!(
@@ -322,7 +331,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
 
 #[test]
 fn close_without_peers_is_quick() {
-    let publisher = ZenohPublisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
     let started = Stopwatch::start();
     publisher.close().unwrap();
     assert!(started.secs() < 2.0, "{} s", started.secs());
@@ -339,7 +348,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     std::fs::write(&path, text).unwrap();
     let mut params = params("nonsense that nobody reads");
     params.zenoh_config = path.display().to_string();
-    let mut publisher = ZenohPublisher::open(&params).unwrap();
+    let publisher = Outbox::open(&params).unwrap();
     assert_eq!(publisher.endpoints(), std::slice::from_ref(&endpoint));
     let snapshot = Arc::new(random_snapshot(20, 1, 0, 1));
     publisher.publish(&snapshot).unwrap();
@@ -347,7 +356,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     publisher.close().unwrap();
 
     std::fs::write(&path, "{ listen: ").unwrap();
-    let fault = ZenohPublisher::open(&params).unwrap_err().to_string();
+    let fault = Outbox::open(&params).unwrap_err().to_string();
     assert!(
         fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"),
         "{fault}"
@@ -356,7 +365,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
 
 #[test]
 fn errors_name_the_parameter() {
-    let message = |params: PublishParams| ZenohPublisher::open(&params).unwrap_err().to_string();
+    let message = |params: PublishParams| Outbox::open(&params).unwrap_err().to_string();
     for bad in ["nonsense", "tcp/127.0.0.1", "warp/127.0.0.1:7447"] {
         let found = message(params(bad));
         assert!(found.contains("zenoh_listen"), "{bad}: {found}");
@@ -370,7 +379,7 @@ fn errors_name_the_parameter() {
     // A port that is taken.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("tcp/{}", listener.local_addr().unwrap());
-    let fault = ZenohPublisher::open(&params(&taken)).unwrap_err();
+    let fault = Outbox::open(&params(&taken)).unwrap_err();
     assert!(
         matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken),
         "{fault}"

@@ -2,15 +2,23 @@
 
 use splat_mapper::map::snapshot::Snapshot;
 use splat_mapper::publish::assemble::{Assembler, Counts};
-use splat_mapper::publish::type_hash::{dds_type_name, type_hash};
+use splat_mapper::publish::correction::MapCorrection;
+use splat_mapper::publish::service::SERVICES;
+use splat_mapper::publish::status::MapperStatus;
+use splat_mapper::publish::type_hash::{dds_type_name, service_hash, type_hash};
 use splat_mapper::publish::wire::{
     self, KeyframeArray, KeyframePoseMsg, Messages, SplatChunk, SplatManifest,
+};
+use splat_mapper::ros::odometry::Odometry;
+use splat_mapper::ros::standard::{
+    DiagnosticArray, MarkerArray, Path, PointCloud2, PoseWithCovarianceStamped,
 };
 use splat_mapper::ros::{self, Image, PoseStamped, TfMessage};
 
 use crate::formats::{Dice, random_snapshot};
 
 const MAX_BYTES: usize = 64 << 20;
+const FRAME: &str = "splat_map";
 
 /// One message of any kind.
 #[derive(Clone)]
@@ -21,7 +29,7 @@ enum Piece {
 }
 
 fn pieces(snapshot: &Snapshot, chunk_bytes: usize) -> Vec<Piece> {
-    let messages = Messages::new(snapshot, chunk_bytes);
+    let messages = Messages::new(snapshot, FRAME, chunk_bytes);
     let mut pieces = vec![Piece::Manifest(messages.manifest())];
     pieces.extend(messages.keyframes().map(Piece::Keyframes));
     pieces.extend(messages.chunks().map(Piece::Chunk));
@@ -188,7 +196,10 @@ fn made_up_counts_and_endless_revisions_stay_within_the_byte_bound() {
     let max_bytes = 1 << 20;
     let mut assembler = Assembler::new(max_bytes);
     let snapshot = random_snapshot(1000, 2, 1, 4);
-    let chunk = Messages::new(&snapshot, 64 << 10).chunks().next().unwrap();
+    let chunk = Messages::new(&snapshot, FRAME, 64 << 10)
+        .chunks()
+        .next()
+        .unwrap();
     for ix in 0..20_000_u32 {
         let forged = SplatChunk {
             n_splats: u32::MAX,
@@ -221,7 +232,7 @@ fn payloads_of_noise_are_rejected_one_by_one() {
     let mut dice = Dice(12);
     let mut assembler = Assembler::new(1 << 20);
     let snapshot = random_snapshot(200, 5, 1, 4);
-    let messages = Messages::new(&snapshot, 4096);
+    let messages = Messages::new(&snapshot, FRAME, 4096);
     let good = [
         (
             dds_type_name::<SplatChunk>(),
@@ -268,7 +279,7 @@ fn payloads_of_noise_are_rejected_one_by_one() {
 fn messages_keep_their_size_bounds() {
     let snapshot = random_snapshot(20_000, 5000, 1, 4);
     for chunk_bytes in [1024, 196_608, 262_144, usize::MAX] {
-        let messages = Messages::new(&snapshot, chunk_bytes);
+        let messages = Messages::new(&snapshot, FRAME, chunk_bytes);
         for chunk in messages.chunks() {
             assert!(chunk.data.len() <= chunk_bytes.min(512 << 10));
         }
@@ -287,7 +298,7 @@ fn messages_keep_their_size_bounds() {
 #[test]
 fn messages_survive_cdr() {
     let snapshot = random_snapshot(100, 3, 1, 4);
-    let messages = Messages::new(&snapshot, 4096);
+    let messages = Messages::new(&snapshot, FRAME, 4096);
     let chunk = messages.chunks().nth(1).unwrap();
     assert_eq!(
         ros::decode::<SplatChunk>(&wire::payload(&chunk).unwrap()).unwrap(),
@@ -298,9 +309,7 @@ fn messages_survive_cdr() {
         ros::decode::<KeyframeArray>(&wire::payload(&array).unwrap()).unwrap(),
         array
     );
-    let pose = messages.pose().unwrap();
-    assert_eq!(pose.pose, snapshot.poses[2].map_from_cam.into());
-    assert_eq!(pose.header.frame_id, "map");
+    assert_eq!(array.header.frame_id, FRAME);
     // Outside, the centre of the first pixel is 0.
     assert_eq!(array.keyframes[0].cx, snapshot.poses[0].intrinsics.cx - 0.5);
 }
@@ -322,10 +331,6 @@ fn type_hashes_are_those_of_ros_2() {
         "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
     );
     assert_eq!(
-        type_hash::<SplatChunk>(),
-        "RIHS01_151a9b7a03a5724d3969b9ee1419ffe8d12217df8ea78786242c8855d97fb54a"
-    );
-    assert_eq!(
         type_hash::<SplatManifest>(),
         "RIHS01_d9cfd3a8140918ac501a45c04c77ef7542bce4930799ea7e572cdcb21213d2c7"
     );
@@ -337,8 +342,110 @@ fn type_hashes_are_those_of_ros_2() {
         type_hash::<KeyframeArray>(),
         "RIHS01_806a2f07d3cfca046a753e9369f2660b97174ae473b33db404d701f8a62a4e8a"
     );
+    for (found, expected) in [
+        (
+            type_hash::<PoseWithCovarianceStamped>(),
+            "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+        ),
+        (
+            type_hash::<Odometry>(),
+            "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+        ),
+        (
+            type_hash::<Path>(),
+            "1957a5bb3cee5da65c4e52e52b65a93df227efce4c20f8458b36e73066ca334b",
+        ),
+        (
+            type_hash::<PointCloud2>(),
+            "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+        ),
+        (
+            type_hash::<MarkerArray>(),
+            "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
+        ),
+        (
+            type_hash::<DiagnosticArray>(),
+            "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+        ),
+        (
+            type_hash::<MapperStatus>(),
+            "81c00c925b2ca5f9062f34ad758455359b157dd4802945d68b9161dab3092f42",
+        ),
+        (
+            type_hash::<MapCorrection>(),
+            "bc02b13fe230318792a69668c12928a4cf329f4a06f863afda3cadbf829077bd",
+        ),
+    ] {
+        assert_eq!(found, format!("RIHS01_{expected}"));
+    }
     assert_eq!(
         dds_type_name::<PoseStamped>(),
         "geometry_msgs::msg::dds_::PoseStamped_"
     );
+}
+
+/// By rosidl of ROS 2 Jazzy.
+#[test]
+fn hashes_of_services_are_those_of_ros_2() {
+    let expected = [
+        (
+            "save_map",
+            "8827476c1dad89884b6b6cebc2d2e3447261d0b848a17c1761b09d0bbb140409",
+        ),
+        (
+            "load_map",
+            "0fec098bb8aca37c58c2190e005af6b5f8ff26ae2abc9d3cdb4e61633317b4bb",
+        ),
+        (
+            "export",
+            "c22bfbe66406c0ce48baf0c99d66f16868bfdba81ca272449e1aa5fb2a7a562a",
+        ),
+        (
+            "render_view",
+            "603bc88562600aff945d6fdfb5a555f43dc324fcdca174b76992d2bf43ea052c",
+        ),
+        (
+            "reset",
+            "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+        ),
+    ];
+    for (name, hash) in expected {
+        let service = SERVICES.iter().find(|s| s.name == name).unwrap();
+        let found = service_hash(
+            service.type_name,
+            service.request_definition,
+            service.response_definition,
+        );
+        assert_eq!(found, format!("RIHS01_{hash}"), "{name}");
+    }
+}
+
+/// The files of msgs/srv say the same as the node.
+#[test]
+fn services_are_as_their_files_say() {
+    let fields = |text: &str| -> Vec<String> {
+        let lines = text.lines().map(|l| l.split('#').next().unwrap().trim());
+        lines
+            .filter(|l| !l.is_empty())
+            .map(|l| l.split_whitespace().collect::<Vec<_>>().join(" "))
+            .collect()
+    };
+    for service in &SERVICES {
+        let Some(name) = service.type_name.strip_prefix("splat_mapper_msgs/srv/") else {
+            continue;
+        };
+        let file = std::fs::read_to_string(format!("msgs/srv/{name}.srv")).unwrap();
+        let (request, response) = file.split_once("---").unwrap();
+        let root = |definition: &str| definition.split("====").next().unwrap().to_owned();
+        assert_eq!(
+            fields(request),
+            fields(&root(service.request_definition)),
+            "{name}"
+        );
+        assert_eq!(
+            fields(response),
+            fields(&root(service.response_definition)),
+            "{name}"
+        );
+    }
 }

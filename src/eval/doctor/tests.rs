@@ -60,7 +60,9 @@ fn an_installed_ros_is_named_with_its_line_to_source() {
         fix.starts_with("source ") && fix.ends_with("jazzy/setup.bash"),
         "{fix}"
     );
-    assert_eq!(ros2(Some("jazzy".to_owned()), root.path()).state, State::Ok);
+    let sourced = ros2(Some("jazzy".to_owned()), root.path());
+    let is_spoken = cfg!(feature = "ros2");
+    assert_eq!(sourced.state == State::Ok, is_spoken, "{sourced:?}");
 }
 
 #[test]

@@ -1,11 +1,8 @@
 //! Scale by odometry, depth pictures and the floor.
 
 use super::*;
+use crate::geometry::align::noise::normal;
 use glam::DQuat;
-
-fn normal(rng: &mut Pcg64Mcg) -> f64 {
-    (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0
-}
 
 fn at(place: DVec3) -> Rigid {
     Rigid::new(DQuat::IDENTITY, place)

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
+use crate::queue::Received;
 use crate::source::camera::stamps::{N_READINGS, StampMap};
 use crate::source::camera::{Camera, CameraError, Layout};
 
@@ -138,9 +139,25 @@ impl Live {
 
     /// Waits for a good picture and hands it to `take`; `None` at the end.
     pub fn next<R>(&mut self, take: impl FnOnce(&Layout, Stamp, &[u8]) -> R) -> Option<R> {
+        match self.next_within(Duration::MAX, take) {
+            Received::Item(taken) => Some(taken),
+            Received::Nothing | Received::Ended => None,
+        }
+    }
+
+    /// The same, but waits no longer than that, give or take a tenth of a second.
+    pub fn next_within<R>(
+        &mut self,
+        patience: Duration,
+        take: impl FnOnce(&Layout, Stamp, &[u8]) -> R,
+    ) -> Received<R> {
+        let watch = Stopwatch::start();
         loop {
             if self.is_over() {
-                return None;
+                return Received::Ended;
+            }
+            if watch.elapsed() >= patience {
+                return Received::Nothing;
             }
             let Some(camera) = &mut self.camera else {
                 self.try_again();
@@ -158,7 +175,7 @@ impl Live {
                         let stamp = self.stamps.stamp(shot.taken_nanos, &shot.now);
                         let taken = take(&self.layout, stamp, shot.bytes);
                         self.went_well();
-                        return Some(taken);
+                        return Received::Item(taken);
                     }
                 }
                 Ok(None) => {}

@@ -15,13 +15,14 @@ use std::time::Duration;
 use crate::clock::Stamp;
 use crate::config::SourceParams;
 use crate::frame::{Frame, RgbImage};
+use crate::queue::Received;
 use crate::source::camera::live::{Live, Opener};
 use crate::source::camera::stamps::ClockReading;
 use crate::source::decode::DecodeError;
 use crate::source::intake::{Extras, Intake};
 use crate::source::jpeg::Jpeg;
 use crate::source::pixels::{PixelFormat, Pixels, YuvColour, to_rgb};
-use crate::source::{Source, SourceCounts, SourceError, camera_info};
+use crate::source::{Polled, Source, SourceCounts, SourceError, camera_info};
 
 /// What the pictures of an open camera are.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -147,6 +148,23 @@ impl CameraSource {
         self.live.health()
     }
 
+    fn poll_within(&mut self, patience: Duration) -> Received<Frame> {
+        while !self.intake.is_full() {
+            let (intake, jpeg) = (&mut self.intake, &mut self.jpeg);
+            let received = self.live.next_within(patience, |layout, stamp, bytes| {
+                frame_of(intake, jpeg, layout, stamp, bytes)
+            });
+            self.count();
+            match received {
+                Received::Item(Some(frame)) => return Received::Item(frame),
+                Received::Item(None) => {}
+                Received::Nothing => return Received::Nothing,
+                Received::Ended => return Received::Ended,
+            }
+        }
+        Received::Ended
+    }
+
     fn count(&mut self) {
         let tally = self.live.take_tally();
         self.intake.missed(tally.missed);
@@ -161,17 +179,22 @@ impl CameraSource {
 
 impl Source for CameraSource {
     fn next(&mut self) -> Option<Frame> {
-        while !self.intake.is_full() {
-            let (intake, jpeg) = (&mut self.intake, &mut self.jpeg);
-            let frame = self
-                .live
-                .next(|layout, stamp, bytes| frame_of(intake, jpeg, layout, stamp, bytes));
-            self.count();
-            if let Some(frame) = frame? {
-                return Some(frame);
-            }
+        match self.poll_within(Duration::MAX) {
+            Received::Item(frame) => Some(frame),
+            Received::Nothing | Received::Ended => None,
         }
-        None
+    }
+
+    fn poll(&mut self, patience: Duration) -> Polled {
+        match self.poll_within(patience) {
+            Received::Item(frame) => Polled::Frame(Box::new(frame)),
+            Received::Nothing => Polled::Waiting,
+            Received::Ended => Polled::Ended,
+        }
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        self.live.health().get().fault.into_iter().collect()
     }
 
     fn counts(&self) -> SourceCounts {

@@ -167,7 +167,7 @@ fn record(
 struct Wheels {
     track: Vec<Rigid>,
     odometry: Topic,
-    mounted: Option<Topic>,
+    mounted: Topic,
 }
 
 impl Wheels {
@@ -178,7 +178,7 @@ impl Wheels {
         Ok(Some(Self {
             track: odometry::track(take, noise),
             odometry: out.topic::<Odometry>("/odom")?,
-            mounted: Some(out.topic::<TfMessage>("/tf_static")?),
+            mounted: out.topic::<TfMessage>("/tf_static")?,
         }))
     }
 
@@ -189,13 +189,13 @@ impl Wheels {
         nanos: u64,
         header: Header,
     ) -> Result<(), String> {
-        if let Some(mut mounted) = self.mounted.take() {
+        if ix == 0 {
             let base = Header {
                 frame_id: BASE.to_owned(),
                 ..header.clone()
             };
             let message = transform(base, CAMERA, odometry::base_from_cam().into());
-            out.write(&mut mounted, nanos, &message)?;
+            out.write(&mut self.mounted, nanos, &message)?;
         }
         let mut message = Odometry {
             header,

@@ -1,0 +1,117 @@
+//! Services: each question leaves the node's thread as CDR and comes back answered, from a thread that may wait.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+
+use r2r::splat_mapper_msgs::srv::{Export, GetSplats, LoadMap, RenderView, SaveMap};
+use r2r::std_srvs::srv::Trigger;
+use r2r::{QosProfile, ServiceRequest, WrappedServiceTypeSupport, WrappedTypesupport};
+
+use crate::source::ros2::link::{Link, LinkError};
+
+/// Questions that wait for the thread that answers.
+const MAX_WAITING: usize = 8;
+
+/// Name of a service and its question as CDR -> the answer as CDR. May wait for seconds; never fails.
+pub type Desk = Arc<dyn Fn(&'static str, &[u8]) -> Vec<u8> + Send + Sync>;
+
+pub(super) type Job = Box<dyn FnOnce() + Send>;
+
+/// The thread that answers; ends when the last sender of jobs is gone.
+pub(super) fn clerk() -> Result<SyncSender<Job>, std::io::Error> {
+    let (jobs, taken): (SyncSender<Job>, Receiver<Job>) = sync_channel(MAX_WAITING);
+    std::thread::Builder::new()
+        .name("ros2-services".to_owned())
+        .spawn(move || {
+            while let Ok(job) = taken.recv() {
+                job();
+            }
+        })?;
+    Ok(jobs)
+}
+
+/// Offers the services of the mapper. The same desk serves all.
+pub(super) fn offer(link: &Link, desk: &Desk, jobs: &SyncSender<Job>) -> Result<(), LinkError> {
+    serve::<SaveMap::Service>(link, "save_map", desk, jobs)?;
+    serve::<LoadMap::Service>(link, "load_map", desk, jobs)?;
+    serve::<Export::Service>(link, "export", desk, jobs)?;
+    serve::<Trigger::Service>(link, "reset", desk, jobs)?;
+    serve::<Trigger::Service>(link, "pause", desk, jobs)?;
+    serve::<Trigger::Service>(link, "resume", desk, jobs)?;
+    serve::<GetSplats::Service>(link, "get_splats", desk, jobs)?;
+    serve::<RenderView::Service>(link, "render_view", desk, jobs)
+}
+
+fn serve<T>(
+    link: &Link,
+    name: &'static str,
+    desk: &Desk,
+    jobs: &SyncSender<Job>,
+) -> Result<(), LinkError>
+where
+    T: WrappedServiceTypeSupport + 'static,
+    T::Request: Send,
+    T::Response: Send,
+{
+    let (desk, jobs) = (Arc::clone(desk), jobs.clone());
+    listen::<T>(link, name, move |request| {
+        let desk = Arc::clone(&desk);
+        let job: Job = Box::new(move || {
+            let response = answered::<T>(&request.message, name, &desk);
+            respond(request, response, name);
+        });
+        if jobs.try_send(job).is_err() {
+            tracing::warn!("{MAX_WAITING} questions wait: one to {name} is left without an answer");
+        }
+    })
+}
+
+/// Calls `take` with each request of a service, on the node's thread.
+pub(super) fn listen<T>(
+    link: &Link,
+    name: &'static str,
+    mut take: impl FnMut(ServiceRequest<T>) + Send + 'static,
+) -> Result<(), LinkError>
+where
+    T: WrappedServiceTypeSupport + 'static,
+{
+    link.ask(&format!("the service {name:?}"), move |spun| {
+        let qos = QosProfile::services_default();
+        let requests = spun.node.create_service::<T>(&format!("~/{name}"), qos)?;
+        spun.drain(requests, move |request| {
+            take(request);
+            true
+        });
+        Ok(())
+    })
+}
+
+pub(super) fn respond<T>(request: ServiceRequest<T>, response: T::Response, name: &str)
+where
+    T: WrappedServiceTypeSupport + 'static,
+{
+    // The asker, or the node, may be gone.
+    if let Err(e) = request.respond(response) {
+        tracing::debug!("an answer of {name} was not sent: {e}");
+    }
+}
+
+fn answered<T: WrappedServiceTypeSupport>(
+    question: &T::Request,
+    name: &'static str,
+    desk: &Desk,
+) -> T::Response {
+    let answer = question
+        .to_serialized_bytes()
+        .and_then(|question| T::Response::from_serialized_bytes(&desk(name, &question)));
+    // Both sides are our own definitions.
+    answer.unwrap_or_else(|e| {
+        tracing::warn!("an answer of {name} was lost: {e}");
+        T::Response::default()
+    })
+}
+
+/// Asks the desk for one of the services without arguments; says whether it was done.
+pub(super) fn trigger(desk: &Desk, name: &'static str) -> bool {
+    answered::<Trigger::Service>(&Trigger::Request::default(), name, desk).success
+}

@@ -1,0 +1,304 @@
+"""What the node tells while it maps recordings/demo.mcap, and how it serves: poses, transforms, clouds, splats, services."""
+
+import json
+import os
+import pathlib
+import shutil
+import sys
+import time
+
+import numpy
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from splat_mapper_msgs.msg import KeyframeArray, MapCorrection, MapperStatus, SplatChunk, SplatDelta, SplatManifest
+from splat_mapper_msgs.srv import Export, GetSplats, LoadMap, RenderView, SaveMap
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+
+from mapper import ROOT, Checks, Mapper, Observer, wait_until
+from robot import CAMERA_FRAME, Robot, load, matrix, nanos_of, odometry
+from splats import Client, crc32c
+
+check = Checks()
+OUT = pathlib.Path(os.environ.get("ROS_TEST_OUT", "/tmp")) / "map"
+LATE = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+DEEP = QoSProfile(depth=2000)
+# Seconds that are added to the recording's stamps in its second pass.
+SECOND_PASS = 20
+# Small enough for two slow cores.
+SMALL = """source.max_side=320 map.max_side=160 map.sh_degree=0 map.max_splats=6000 map.seeds_per_keyframe=400 map.steps=100
+select.max_rate_hz=3 select.batch_size=4 select.batch_overlap=1 backend=cpu geometry=known
+source.pose_topic=/ground_truth/pose source.depth_topic=/camera/depth use_sim_time=true""".split()
+SOURCE = ["run", "--source", "ros2:/camera/image_raw"]
+
+
+def settings(*words):
+    return [part for word in words for part in ("--set", word)]
+
+
+class Listening:
+    """Everything that the node says."""
+
+    def __init__(self, observer):
+        listen = observer.listen
+        self.pose = listen(PoseWithCovarianceStamped, "/splat_mapper/pose", BEST_EFFORT)
+        self.odometry = listen(Odometry, "/splat_mapper/odometry")
+        self.tf = listen(TFMessage, "/tf", 100)
+        self.tf_static = listen(TFMessage, "/tf_static", LATE)
+        self.path = listen(Path, "/splat_mapper/path", LATE)
+        self.cloud = listen(PointCloud2, "/splat_mapper/cloud", LATE)
+        self.keyframe_cloud = listen(PointCloud2, "/splat_mapper/keyframe_cloud", BEST_EFFORT)
+        self.keyframes = listen(KeyframeArray, "/splat_mapper/keyframes", LATE)
+        self.manifest = listen(SplatManifest, "/splat_mapper/splats/manifest", LATE)
+        self.splats = listen(SplatChunk, "/splat_mapper/splats", DEEP)
+        self.delta = listen(SplatDelta, "/splat_mapper/splats/delta", DEEP)
+        self.correction = listen(MapCorrection, "/splat_mapper/correction", LATE)
+        self.status = listen(MapperStatus, "/splat_mapper/status", LATE)
+        self.diagnostics = listen(DiagnosticArray, "/diagnostics")
+
+    def level(self, part):
+        """The newest level of a part in /diagnostics."""
+        for _, array in reversed(self.diagnostics):
+            for status in array.status:
+                if status.name.endswith(part):
+                    return int.from_bytes(status.level, "little")
+        return None
+
+
+def matrix_of(pose):
+    return matrix(pose.position, pose.orientation)
+
+
+def points_of(cloud):
+    """x y z of a PointCloud2, by its own fields."""
+    offsets = {field.name: (field.offset, field.datatype) for field in cloud.fields}
+    assert all(offsets[axis][1] == 7 for axis in "xyz"), "float32"
+    data = numpy.frombuffer(bytes(cloud.data), numpy.uint8).reshape(-1, cloud.point_step)
+    columns = [data[:, offsets[a][0] : offsets[a][0] + 4].copy().view("<f4")[:, 0] for a in "xyz"]
+    return numpy.stack(columns, 1)
+
+
+def check_poses(heard, robot):
+    sent = {nanos + SECOND_PASS * 10**9: payload for nanos, payload in robot.poses.items()}
+    poses = [m for _, m in heard.pose if nanos_of(m.header.stamp) in sent]
+    check("poses come, at stamps of pictures, best effort", len(poses) > 5, len(poses))
+    check("a pose is of the map frame", all(m.header.frame_id == "map" for m in poses))
+    spread = [numpy.diag(numpy.reshape(m.pose.covariance, (6, 6))) for m in poses]
+    check("each says how sure it is", all(numpy.isfinite(s).all() and (s > 0).all() for s in spread))
+    errors = []
+    for message in poses:
+        base = odometry(sent[nanos_of(message.header.stamp)]).transform
+        wanted = matrix(base.translation, base.rotation)
+        errors.append(numpy.linalg.norm(matrix_of(message.pose.pose)[:3, 3] - wanted[:3, 3]))
+    # The recording's world is odometry's frame here, and the poses are given: what is left is tracking.
+    median = float(numpy.median(errors)) if errors else numpy.inf
+    check("poses are the robot's, in metres", median < 0.1, f"median error {median:.3f} m")
+    moves = [m for _, m in heard.odometry]
+    named = {(m.header.frame_id, m.child_frame_id) for m in moves}
+    check("odometry is of base_link in odom", named == {("odom", "base_link")}, named)
+
+
+def parents(heard):
+    """Parents of each frame, over all that was broadcast."""
+    found = {}
+    for _, message in [*heard.tf, *heard.tf_static]:
+        for transform in message.transforms:
+            found.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
+    return found
+
+
+def check_transforms(heard):
+    found = parents(heard)
+    check("each frame has one parent", all(len(p) == 1 for p in found.values()), found)
+    check("map is above odom, odom above base_link", found.get("odom") == {"map"} and found.get("base_link") == {"odom"})
+    own = [(at, m) for at, m in heard.tf if any(t.child_frame_id == "odom" for t in m.transforms)]
+    children = {t.child_frame_id for _, m in own for t in m.transforms}
+    check("the node sends map to odom and leaves odom to base_link to odometry", children == {"odom", "splat_map"}, children)
+    times = [at for at, _ in own]
+    gaps = numpy.diff(times) if len(times) > 1 else numpy.array([numpy.inf])
+    rate = 1.0 / float(numpy.median(gaps))
+    check("map to odom comes at 20 Hz or more", rate >= 20.0, f"{rate:.1f} Hz, {len(own)} messages")
+
+
+def check_clouds(heard):
+    path = heard.path[-1][1] if heard.path else Path()
+    check("the path is of the map frame and has the keyframes", path.header.frame_id == "map" and len(path.poses) > 3, len(path.poses))
+    cloud = heard.cloud[-1][1] if heard.cloud else PointCloud2()
+    points = points_of(cloud) if cloud.data else numpy.zeros((0, 3))
+    check("the cloud has points, finite, of the map frame", len(points) > 100 and numpy.isfinite(points).all() and cloud.header.frame_id == "map", len(points))
+    seen = heard.keyframe_cloud[-1][1] if heard.keyframe_cloud else PointCloud2()
+    ahead = points_of(seen) if seen.data else numpy.zeros((0, 3))
+    check("a keyframe's cloud is of the camera's frame, ahead of it", len(ahead) > 100 and (ahead[:, 2] > 0).all() and seen.header.frame_id == CAMERA_FRAME, len(ahead))
+
+
+def check_stream(heard):
+    """Every whole snapshot and delta that was heard, put together as a client would."""
+    by_revision, deltas = {}, {}
+    for _, chunk in heard.splats:
+        by_revision.setdefault((bytes(chunk.map_id), chunk.revision), []).append(chunk)
+    for _, piece in heard.delta:
+        deltas.setdefault((bytes(piece.map_id), piece.revision), []).append(piece)
+    wholes = {key: chunks for key, chunks in by_revision.items() if len(chunks) == chunks[0].n_chunks}
+    check("whole snapshots come in pieces", len(wholes) > 0, f"{len(wholes)} of {len(by_revision)} complete")
+    check("and small enough ones", all(len(c.data) <= 262_144 for chunks in wholes.values() for c in chunks))
+    good, n_followed = True, 0
+    client = Client()
+    for key in sorted([*wholes, *deltas], key=lambda key: key[1]):
+        if key in wholes:
+            client.whole(wholes[key])
+            good &= client.digest() == bytes(wholes[key][0].map_sha256)
+        elif len(deltas[key]) == deltas[key][0].n_pieces and client.delta(deltas[key]):
+            n_followed += 1
+            good &= client.digest() == bytes(deltas[key][0].map_sha256)
+    check("splats put together have the digest that was told", good and wholes, f"{n_followed} deltas")
+    first = next(iter(wholes.values()), [None])[0]
+    check("a chunk's checksum fits", first is not None and crc32c(bytes(first.data)) == first.crc32c)
+
+
+def fetch(observer):
+    """The published map by service: (manifest, digest)."""
+    request = GetSplats.Request(revision=0, first_chunk=0, max_chunks=3)
+    response = observer.call(GetSplats, "/splat_mapper/get_splats", request)
+    manifest, chunks = response.manifest, list(response.chunks)
+    while response.success and len(chunks) < manifest.n_chunks:
+        request = GetSplats.Request(revision=manifest.revision, first_chunk=len(chunks), max_chunks=3)
+        response = observer.call(GetSplats, "/splat_mapper/get_splats", request)
+        if not response.success:
+            return fetch(observer)
+        chunks += response.chunks
+    client = Client()
+    client.whole(chunks)
+    return manifest, client.digest()
+
+
+def check_services(observer):
+    def file(kind, name, path):
+        return observer.call(kind, f"/splat_mapper/{name}", kind.Request(path=path))
+
+    saved = file(SaveMap, "save_map", "a.splatmap")
+    check("save_map saves", saved.success and pathlib.Path(saved.path).stat().st_size > 1000, saved.message)
+    out = file(SaveMap, "save_map", "../a.splatmap")
+    check("save_map stays in its folder", not out.success, out.message)
+    ply = file(Export, "export", "a.ply")
+    check("export writes", ply.success and pathlib.Path(ply.path).read_bytes()[:3] == b"ply", ply.message)
+    wrong = file(Export, "export", "a.exe")
+    check("export knows what it can write", not wrong.success, wrong.message)
+    missing = file(LoadMap, "load_map", "no_such.splatmap")
+    check("load_map of a file that is not there is refused", not missing.success and missing.message, missing.message)
+
+    camera = CameraInfo(width=80, height=60, k=[80.0, 0.0, 39.5, 0.0, 80.0, 29.5, 0.0, 0.0, 1.0])
+    request = RenderView.Request(camera=camera, with_depth=True)
+    request.pose.orientation.w = 1.0
+    view = observer.call(RenderView, "/splat_mapper/render_view", request)
+    fits = len(view.image.data) == 80 * 60 * 3 and len(view.depth.data) == 80 * 60 * 4
+    check("render_view renders, with depth", view.success and fits and view.image.encoding == "rgb8", view.message)
+    request.camera.width = 100_000
+    huge = observer.call(RenderView, "/splat_mapper/render_view", request)
+    check("render_view refuses a huge picture", not huge.success, huge.message)
+
+    manifest, digest = fetch(observer)
+    check("get_splats brings the published map", digest == bytes(manifest.map_sha256) and manifest.n_splats > 0, manifest.n_splats)
+    gone = observer.call(GetSplats, "/splat_mapper/get_splats", GetSplats.Request(revision=4_000_000_000, max_chunks=1))
+    check("get_splats says when a revision is gone", not gone.success, gone.message)
+
+
+def check_switches(observer, heard, robot, mapper):
+    call = lambda name: observer.call(Trigger, f"/splat_mapper/{name}", Trigger.Request())  # noqa: E731
+    state = lambda: heard.status[-1][1].state if heard.status else None  # noqa: E731
+    robot.start(rate=1.0, to_ix=40)
+    paused = call("pause")
+    check("pause pauses", paused.success and wait_until(lambda: state() == MapperStatus.STATE_PAUSED, 5.0), paused.message)
+    resumed = call("resume")
+    check("resume goes on", resumed.success and wait_until(lambda: state() != MapperStatus.STATE_PAUSED, 5.0), resumed.message)
+    reset = call("reset")
+    check("reset begins a new map", reset.success and mapper.wait_for_log("the map begins again", 20.0), reset.message)
+    robot.wait()
+
+
+def check_late(heard):
+    late = Observer("late")
+    late_heard = Listening(late)
+    latched = ["path", "cloud", "manifest", "keyframes", "status"]
+    wait_until(lambda: all(getattr(late_heard, name) for name in latched), 5.0)
+    missing = [name for name in latched if not getattr(late_heard, name)]
+    check("who comes late gets what is latched", not missing, missing)
+    late.close()
+    check("the status counts", heard.status[-1][1].frames_received > 0 and heard.status[-1][1].keyframes_placed > 0)
+
+
+def with_odometry(observer, recording):
+    shutil.rmtree(OUT, ignore_errors=True)
+    OUT.mkdir(parents=True)
+    words = [*SMALL, f"publish.folder={OUT / 'maps'}", "publish.full_secs=4", "map.snapshot_secs=1", "publish.linger_secs=60"]
+    mapper = Mapper(*SOURCE, "--out", str(OUT / "run"), *settings(*words), log="map.log")
+    heard = Listening(observer)
+    mapper.wait_for_log("ROS 2 node")
+    robot = Robot(observer.node, recording)
+    wait_until(lambda: robot.to_info.get_subscription_count() > 0, 5.0)
+    check_switches(observer, heard, robot, mapper)
+    robot.start(rate=1.0, offset_nanos=SECOND_PASS * 10**9)
+    check("diagnostics are fine while pictures come", wait_until(lambda: heard.level("input") == 0, 5.0))
+    robot.wait()
+    check("diagnostics warn when the camera stops", wait_until(lambda: heard.level("input") == 1, 4.0))
+    check("and call it an error after a while", wait_until(lambda: heard.level("input") == 2, 6.0))
+    placed = wait_until(lambda: heard.cloud and heard.status[-1][1].splats > 0, 60.0)
+    check("a map has come", placed, f"{heard.status[-1][1].splats} splats")
+    check_poses(heard, robot)
+    check_transforms(heard)
+    check_clouds(heard)
+    check_late(heard)
+    check_services(observer)
+    # Time jumps back: the input ends, and the last map goes out whole.
+    robot.start(to_ix=3)
+    report = OUT / "run/report.json"
+    check("the end of the input ends the map", wait_until(report.is_file, 60.0))
+    time.sleep(1.0)
+    manifest, digest = fetch(observer)
+    saved = json.loads(report.read_text())["map_sha256"]
+    check("splats that were sent are the map that was saved", digest.hex() == saved == bytes(manifest.map_sha256).hex(), saved[:16])
+    check_stream(heard)
+    code, secs = mapper.end()
+    check("SIGINT ends it, cleanly", code == 0 and secs <= 2.0, f"exit {code} after {secs:.2f} s")
+    robot.wait()
+
+
+def without_odometry(observer, recording):
+    """Compressed pictures, another name, and nothing else on tf: the node sends the whole tree."""
+    arguments = ["--ros-args", "-r", "__ns:=/bot", "-r", "__node:=mapper"]
+    mapper = Mapper(*SOURCE, *settings(*SMALL), *arguments, log="map_alone.log")
+    mapper.wait_for_log("ROS 2 node")
+    tf = observer.listen(TFMessage, "/tf", 100)
+    begin = len(tf)
+    poses = observer.listen(PoseWithCovarianceStamped, "/bot/mapper/pose")
+    robot = Robot(observer.node, recording, picture_type=CompressedImage, with_odometry=False)
+    wait_until(lambda: robot.to_picture.get_subscription_count() > 0, 5.0)
+    robot.start(rate=1.0, to_ix=90)
+    check("poses come under the node's own name", wait_until(lambda: len(poses) > 3, 40.0), len(poses))
+    links = {(t.header.frame_id, t.child_frame_id) for _, m in tf[begin:] for t in m.transforms}
+    check("without odometry the node sends map to odom to base_link", {("map", "odom"), ("odom", "base_link")} <= links, links)
+    code, secs = mapper.end()
+    check("SIGINT while mapping ends it within 2 s", secs <= 2.0 and code in (0, 1), f"exit {code} after {secs:.2f} s")
+    robot.stop()
+
+
+def main():
+    rclpy.init()
+    recording = load(ROOT / "recordings/demo.mcap")
+    observer = Observer()
+    with_odometry(observer, recording)
+    observer.close()
+    observer = Observer("observer_alone")
+    without_odometry(observer, recording)
+    observer.close()
+    rclpy.shutdown()
+    print(f"{check.n - check.n_failed} of {check.n} checks of the map are good")
+    sys.exit(check.n_failed > 0)
+
+
+if __name__ == "__main__":
+    main()
