@@ -82,6 +82,7 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     let mut source = source::open(&args.input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
+    source.end_when(stop.flag());
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
     let told = &found.tracking;
@@ -143,7 +144,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     if let (Some(node), Some(outbox)) = (&ros2, &outbox) {
         node.serve(outbox, &stop, params.ros2.autostart)?;
     }
-    let is_live = params.source.rate > 0.0;
+    let is_live = source.is_live() || params.source.rate > 0.0;
     let job = Job {
         source,
         params: params.clone(),
@@ -208,7 +209,7 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
+pub(super) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {
         if stop.is_asked() {

@@ -75,6 +75,11 @@ impl Stop {
         self.is_asked.store(true, Ordering::Relaxed);
     }
 
+    /// For sources, which know no nodes.
+    pub fn flag(&self) -> &Arc<AtomicBool> {
+        &self.is_asked
+    }
+
     /// Ends this map for a fresh one from the same source.
     fn ask_restart(&self) {
         self.is_restarting.store(true, Ordering::Relaxed);
