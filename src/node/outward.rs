@@ -20,7 +20,7 @@ use crate::queue::{Received, Receiver};
 use crate::track::Tracker;
 
 /// Transforms go out at least so often: consumers like to look back no further (Nav2: 10 Hz, better 20).
-const REPEAT: Duration = Duration::from_millis(40);
+const REPEAT: Duration = Duration::from_millis(30);
 const STATUS_SECS: f64 = 1.0;
 /// Seconds between words of the same trouble.
 const COMPLAIN_SECS: f64 = 10.0;
