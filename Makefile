@@ -1,5 +1,5 @@
-# The four lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint bench ablation soak onnx-test ros2-test setup
+# The lines that people and CI run. `make demo` and `make test` install what is missing first.
+.PHONY: demo test lint v4l2-test record-kill-test bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -18,10 +18,18 @@ lint:
 	cargo fmt --check
 	cargo clippy --release --locked --all-targets -- -D warnings
 
+# Cameras: boots a kernel with made-up ones in QEMU and holds docs/CAMERAS.md against them. Says so where it is skipped.
+v4l2-test:
+	scripts/v4l2_test
+
+# Kills a recording 50 times and reads back what is left, with our reader and with PyPI's mcap.
+record-kill-test:
+	scripts/record_kill_test
+
 # Figures for docs/BENCHMARKS.md: every stage and the whole step, sizes in the names.
 bench:
 	scripts/setup build
-	cargo bench --locked --profile release --bench stages
+	cargo bench --locked --profile release
 
 # The table of what each component is worth, on fox (SPLAT_MAPPER_DATA) and a made-up room; docs/BENCHMARKS.md explains it.
 ablation:

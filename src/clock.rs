@@ -1,6 +1,7 @@
 //! Time: stamps of data, and stopwatches for reports. The only home of `Instant::now`.
 
-use std::time::{Duration, Instant};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// A point in time of the data, in nanoseconds since the epoch of its source (header stamp).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
@@ -17,6 +18,14 @@ impl Stamp {
     pub fn from_secs(secs: f64) -> Self {
         Self {
             nanos: (secs * 1e9).round() as i64,
+        }
+    }
+
+    /// The wall clock, for data that carries no time of its own.
+    pub fn now() -> Self {
+        let since = SystemTime::now().duration_since(UNIX_EPOCH);
+        Self {
+            nanos: since.map_or(0, saturated_nanos),
         }
     }
 
@@ -42,6 +51,16 @@ impl std::fmt::Display for Stamp {
             nanos % 1_000_000_000
         )
     }
+}
+
+fn saturated_nanos(duration: Duration) -> i64 {
+    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
+}
+
+/// Nanoseconds on a clock that nobody sets, since this was first asked.
+pub fn monotonic_nanos() -> i64 {
+    static START: OnceLock<Stopwatch> = OnceLock::new();
+    saturated_nanos(START.get_or_init(Stopwatch::start).elapsed())
 }
 
 /// Wall time since it was started.

@@ -21,6 +21,20 @@ impl std::fmt::Debug for RgbImage {
 }
 
 impl RgbImage {
+    /// The size of a picture whose pixels are elsewhere.
+    pub fn hollow(width_px: u32, height_px: u32) -> Self {
+        Self {
+            width_px,
+            height_px,
+            pixels: Vec::new(),
+        }
+    }
+
+    /// Whether its pixels are elsewhere.
+    pub fn is_hollow(&self) -> bool {
+        self.pixels.is_empty()
+    }
+
     /// Scaled down so that the longer side is at most `max_side_px`; a smaller picture is copied.
     pub fn shrunk(&self, max_side_px: u32) -> Self {
         let longest = self.width_px.max(self.height_px);
@@ -156,6 +170,17 @@ pub struct Keyframe {
     pub frame: Frame,
     /// Runs since the frame was selected: latencies in reports.
     pub age: Stopwatch,
+}
+
+impl Keyframe {
+    /// The same without what takes memory: the pixels, and measured depth.
+    pub fn hollow(&self) -> Self {
+        let image = &self.frame.image;
+        let mut hollow = self.clone();
+        hollow.frame.image = Arc::new(RgbImage::hollow(image.width_px, image.height_px));
+        hollow.frame.truth_depth = None;
+        hollow
+    }
 }
 
 /// Keyframes for one inference; the first `n_shared` were in the batch before.

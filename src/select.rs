@@ -74,6 +74,13 @@ impl Selector {
         }
     }
 
+    /// Where a saved map goes on, its keyframes have the first ids.
+    #[must_use]
+    pub fn counting_from(mut self, first_id: u32) -> Self {
+        self.next_id = first_id;
+        self
+    }
+
     /// Returns the frame as a keyframe when the map should keep it.
     pub fn push(&mut self, frame: Frame) -> Option<Keyframe> {
         if self.params.all {

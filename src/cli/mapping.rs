@@ -23,7 +23,21 @@ pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
             .set("source.rate", 1.0.into())
             .map_err(|e| usage(&e))?;
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.source, args.out.as_deref())
+}
+
+/// `--map` is `map.load`.
+fn load(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
+    if let Some(map) = map {
+        let path = map
+            .to_str()
+            .ok_or_else(|| Usage(format!("--map {} is no text", map.display())))?;
+        settings
+            .set("map.load", path.into())
+            .map_err(|e| usage(&e))?;
+    }
+    Ok(())
 }
 
 pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
@@ -55,6 +69,7 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
             settings.set(key, value).map_err(|e| usage(&e))?;
         }
     }
+    load(&mut settings, args.map.as_deref())?;
     map(&settings, &args.input, args.out.as_deref())
 }
 
@@ -67,6 +82,7 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     let mut source = source::open(&args.input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
+    source.end_when(stop.flag());
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
     let told = &found.tracking;
@@ -128,12 +144,13 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     if let (Some(node), Some(outbox)) = (&ros2, &outbox) {
         node.serve(outbox, &stop, params.ros2.autostart)?;
     }
-    let is_live = params.source.rate > 0.0;
+    let is_live = source.is_live() || params.source.rate > 0.0;
     let job = Job {
         source,
         params: params.clone(),
         is_live,
         stop: stop.clone(),
+        out: out.map(Path::to_owned),
         outbox,
     };
     let bar = bar(is_terminal);
@@ -155,6 +172,14 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
         anyhow::bail!(
             "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
             outcome.snapshot.poses.len()
+        );
+    }
+    if let Some(continued) = outcome.map.continuation().filter(|c| !c.is_joined) {
+        anyhow::bail!(
+            "the recording has no place in the map: {} of {} keyframes were found among the {} of the map, 3 or more must agree; the saved map is as it was, and the recording must see what it was made of, in similar light: {input}",
+            continued.found,
+            continued.asked,
+            continued.keyframes
         );
     }
     if outcome.snapshot.poses.is_empty() {
@@ -184,7 +209,7 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
+pub(super) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {
         if stop.is_asked() {

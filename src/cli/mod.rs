@@ -2,6 +2,7 @@
 
 mod commands;
 mod mapping;
+mod recording;
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -28,6 +29,8 @@ enum Command {
     /// Finds the camera in a map of an earlier run, frame by frame, and leaves the map as it is
     #[command(alias = "localize")]
     Localise(LocaliseArgs),
+    /// Records a camera, or any source, into an MCAP file, until Ctrl-C
+    Record(RecordArgs),
     /// Renders a recording with exact poses and depth
     Synth(SynthArgs),
     /// Compares the keyframes of a run with reference poses
@@ -59,12 +62,15 @@ struct ParamArgs {
 
 #[derive(Debug, Args)]
 struct RunArgs {
-    /// ros2:/TOPIC, mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
+    /// v4l2:/dev/video0, webcam:0, ros2:/TOPIC, mcap:PATH, images:DIR (pictures, COLMAP scene, transforms.json) or synthetic:SCENE
     #[arg(long, value_name = "URI")]
     source: String,
     /// Run directory to write at the end
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -77,6 +83,9 @@ struct ReplayArgs {
     /// Run directory to write
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// map.splatmap of an earlier run to go on from
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
     /// Multiple of the recorded speed, or max; with a number late frames are dropped and counted
     #[arg(long, value_name = "R|max")]
     rate: Option<String>,
@@ -117,6 +126,29 @@ struct LocaliseArgs {
     json: bool,
     #[command(flatten)]
     params: ParamArgs,
+}
+
+#[derive(Debug, Args)]
+struct RecordArgs {
+    /// v4l2:/dev/video0, webcam:0 or any other source that run takes
+    #[arg(long, value_name = "URI")]
+    source: String,
+    /// Recording to write; record.max_file_* splits it into FILE_1.mcap, FILE_2.mcap ...
+    #[arg(long, value_name = "FILE.mcap")]
+    out: PathBuf,
+    /// Ends after so long
+    #[arg(long, value_name = "SECS", value_parser = seconds)]
+    duration: Option<f64>,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
+/// A time that can be waited for.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(secs) if secs > 0.0 && secs.is_finite() => Ok(secs),
+        _ => Err("expected seconds above 0".to_owned()),
+    }
 }
 
 #[derive(Debug, Args)]
@@ -218,6 +250,7 @@ pub fn main() -> ExitCode {
         Command::Run(args) => mapping::run(&args),
         Command::Replay(args) => mapping::replay(&args),
         Command::Localise(args) => mapping::localise(&args),
+        Command::Record(args) => recording::run(&args),
         Command::Synth(args) => commands::synth(&args),
         Command::Eval(args) => commands::eval(&args),
         Command::Render(args) => commands::render(&args),

@@ -13,6 +13,7 @@ mod publish;
 mod range;
 pub mod ros2;
 pub mod scale;
+mod source;
 pub mod track;
 
 use std::cmp::Reverse;
@@ -25,6 +26,7 @@ use serde_json::Value;
 pub use self::known::KnownParams;
 pub use self::publish::{PublishParams, TfMode};
 pub use self::range::Range;
+pub use self::source::{CameraParams, RecordParams, SourceParams};
 use crate::config::align::AlignParams;
 use crate::config::file::{flatten, parse_file};
 use crate::config::range::ranges_of_comments;
@@ -77,6 +79,7 @@ pub struct Params {
     pub sequential: bool,
     pub use_sim_time: bool,
     pub source: SourceParams,
+    pub record: RecordParams,
     pub select: SelectParams,
     pub known: KnownParams,
     pub sfm: SfmParams,
@@ -97,23 +100,6 @@ pub enum Backend {
     Auto,
     Wgpu,
     Cpu,
-}
-
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SourceParams {
-    pub image_topic: String,
-    pub camera_info_topic: String,
-    pub pose_topic: String,
-    pub depth_topic: String,
-    pub odometry_topic: String,
-    pub names: String,
-    pub held_out_names: String,
-    pub pick: usize,
-    pub max_side: u32,
-    pub max_frames: u64,
-    pub rectify: bool,
-    pub rate: f64,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -194,6 +180,12 @@ pub struct MapParams {
     pub max_side: u32,
     pub final_share: f64,
     pub max_splats: usize,
+    pub max_gpu_mib: u64,
+    pub max_keyframes_in_ram: usize,
+    pub max_disk_mib: u64,
+    pub load: String,
+    pub save_pictures: u64,
+    pub autosave_secs: f64,
     pub seeds_per_keyframe: usize,
     pub sh_degree: u8,
     pub holdout: u32,
@@ -329,7 +321,7 @@ impl Settings {
         }
         // 500.0 means 500 where a whole number is asked for; serde would refuse it.
         let value = match value.as_f64() {
-            Some(v) if *whole => Value::from(v as u64),
+            Some(v) if *whole => Value::from(v as i64),
             _ => value,
         };
         self.values.insert(key.to_owned(), value);
@@ -349,19 +341,7 @@ impl Settings {
     pub fn params(&self) -> Result<Params, ConfigError> {
         let mut root = serde_json::Map::new();
         for (key, value) in &self.values {
-            match key.split_once('.') {
-                None => {
-                    root.insert(key.clone(), value.clone());
-                }
-                Some((group, name)) => {
-                    let group = root
-                        .entry(group)
-                        .or_insert_with(|| Value::Object(serde_json::Map::new()));
-                    if let Value::Object(group) = group {
-                        group.insert(name.to_owned(), value.clone());
-                    }
-                }
-            }
+            insert(&mut root, key, value);
         }
         let params: Params = serde_json::from_value(Value::Object(root))
             .expect("params.yaml and config.rs name the same keys");
@@ -387,6 +367,20 @@ impl Settings {
         let same = keys().filter(|known| last(known) == tail).min_by_key(alike);
         let holding = keys().filter(|known| known.contains(&tail));
         same.or_else(|| holding.min_by_key(alike)).cloned()
+    }
+}
+
+/// A value by dotted key, into the groups that the key names.
+fn insert(root: &mut serde_json::Map<String, Value>, key: &str, value: &Value) {
+    let Some((group, rest)) = key.split_once('.') else {
+        root.insert(key.to_owned(), value.clone());
+        return;
+    };
+    let group = root
+        .entry(group)
+        .or_insert_with(|| Value::Object(serde_json::Map::new()));
+    if let Value::Object(group) = group {
+        insert(group, rest, value);
     }
 }
 

@@ -60,9 +60,9 @@ impl std::fmt::Display for Range {
     }
 }
 
-/// Reads the ranges out of the comments of the embedded file, which we write ourselves: two levels, two spaces each.
+/// Reads the ranges out of the comments of the embedded file, which we write ourselves: two spaces a level.
 pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
-    let mut group = String::new();
+    let mut groups: Vec<&str> = Vec::new();
     let mut ranges = BTreeMap::new();
     for line in text.lines() {
         let trimmed = line.trim_start();
@@ -73,11 +73,8 @@ pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
         if indent < 4 || trimmed.starts_with('#') {
             continue;
         }
-        let key = if indent == 4 {
-            name.to_owned()
-        } else {
-            format!("{group}.{name}")
-        };
+        groups.truncate((indent - 4) / 2);
+        let key = [groups.as_slice(), &[name]].concat().join(".");
         match rest
             .split_once(" # ")
             .and_then(|(_, comment)| Range::of_comment(comment.trim()))
@@ -85,7 +82,7 @@ pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
             Some(range) => {
                 ranges.insert(key, range);
             }
-            None => group = name.to_owned(),
+            None => groups.push(name),
         }
     }
     ranges

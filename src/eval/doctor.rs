@@ -2,6 +2,8 @@
 //!
 //! Looks at files, the environment and sockets only: it starts no GPU and changes nothing but one file that it removes.
 
+mod cameras;
+
 use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
@@ -80,7 +82,7 @@ pub fn doctor() -> Vec<Check> {
         vulkan_loader(&library_folders()),
         vulkan_driver(&icd_files()),
         ros2(std::env::var("ROS_DISTRO").ok(), Path::new("/opt/ros")),
-        cameras(Path::new("/dev")),
+        cameras::cameras(),
         onnx_runtime(named_onnx_runtime, &library_folders()),
         multicast(),
     ];
@@ -103,7 +105,12 @@ pub fn format_checks(checks: &[Check]) -> String {
             State::Optional => "optional",
             State::Missing => "MISSING ",
         };
-        text.push_str(&format!("{mark}  {:width$}  {}\n", check.name, check.found));
+        let mut lines = check.found.lines();
+        let first = lines.next().unwrap_or_default();
+        text.push_str(&format!("{mark}  {:width$}  {first}\n", check.name));
+        for line in lines {
+            text.push_str(&format!("          {:width$}  {line}\n", ""));
+        }
         if let Some(fix) = &check.fix {
             text.push_str(&format!("          {:width$}  fix: {fix}\n", ""));
         }
@@ -281,41 +288,6 @@ fn ros2_pictures() -> Vec<Check> {
         )
     };
     vec![topics, profile]
-}
-
-fn cameras(dev: &Path) -> Check {
-    let is_video = |path: &PathBuf| {
-        path.file_name()
-            .is_some_and(|name| name.to_string_lossy().starts_with("video"))
-    };
-    let devices: Vec<PathBuf> = entries(dev).into_iter().filter(is_video).collect();
-    if devices.is_empty() {
-        let fix = "plug a camera in; in a container, pass it on with --device /dev/video0";
-        return Check::optional(
-            "camera",
-            "no /dev/video*; this version reads recordings, a later one cameras too",
-            fix,
-        );
-    }
-    let (readable, locked): (Vec<_>, Vec<_>) = devices
-        .iter()
-        .partition(|path| std::fs::File::open(path).is_ok());
-    let names = |paths: &[&PathBuf]| {
-        paths
-            .iter()
-            .map(|path| path.display().to_string())
-            .collect::<Vec<_>>()
-            .join(" ")
-    };
-    if readable.is_empty() {
-        let found = format!("{} cannot be opened", names(&locked));
-        return Check::optional(
-            "camera",
-            found,
-            "sudo usermod -aG video $USER, then log in again",
-        );
-    }
-    Check::ok("camera", names(&readable))
 }
 
 fn onnx_runtime(named: Option<PathBuf>, folders: &[PathBuf]) -> Check {

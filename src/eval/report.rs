@@ -8,6 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{EvalError, read_text, write_atomically};
+use crate::map::figures::Budgets;
 use crate::map::snapshot;
 use crate::source::SourceCounts;
 
@@ -34,6 +35,11 @@ pub struct Report {
     pub peak_rss_mib: Option<f64>,
     pub peak_gpu_mib: Option<f64>,
     pub quality: Quality,
+    #[serde(default)]
+    pub budgets: Budgets,
+    /// Null where the run began anew.
+    #[serde(default)]
+    pub continued: Option<Continued>,
     pub scale: Scale,
     /// Why the input ended early.
     #[serde(default)]
@@ -62,6 +68,9 @@ pub struct KeyframeCounts {
     pub selected: u64,
     /// With a pose in the map.
     pub registered: u64,
+    /// Of the map that the run went on from; not among the others.
+    #[serde(default)]
+    pub before: u64,
     /// Groups of keyframes whose relation to each other is unknown; the map is the largest.
     pub components: u64,
 }
@@ -124,6 +133,18 @@ pub struct Quality {
     pub ssim_holdout: Option<f64>,
     /// By the network of `eval.lpips_model`; null without one.
     pub lpips_holdout: Option<f64>,
+}
+
+/// How a run that goes on from a map stands to it.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Continued {
+    /// Keyframes of the saved map.
+    pub map_keyframes: u64,
+    /// Keyframes of this run that were looked for in it, and those that were found.
+    pub asked: u64,
+    pub found: u64,
+    /// Whether this run has its place in the map; else nothing was added to it.
+    pub joined: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -45,6 +45,11 @@ impl Drop for Buffer {
 }
 
 impl Meter {
+    /// Bytes that are held.
+    pub fn held_bytes(&self) -> u64 {
+        self.held.load(Ordering::Relaxed)
+    }
+
     /// Most bytes that were held at one time.
     pub fn peak_bytes(&self) -> u64 {
         self.peak.load(Ordering::Relaxed)

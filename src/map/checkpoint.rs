@@ -9,21 +9,22 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use byteorder::{LittleEndian, ReadBytesExt, WriteBytesExt};
-use glam::{DQuat, DVec3};
 
-use crate::camera::Intrinsics;
 use crate::clock::Stamp;
-use crate::map::layout;
-use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
-use crate::pose::Rigid;
+use crate::map::framing::{read_section, write_section};
+use crate::map::regions::Evicted;
+use crate::map::saved_view::SavedView;
+use crate::map::sections::{
+    age_bytes, keyframe_bytes, parse_ages, parse_keyframes, parse_regions, parse_splats,
+    parse_views, regions_len, splat_bytes, view_bytes, write_regions,
+};
+use crate::map::snapshot::{Scale, Snapshot};
 use crate::splat::Splats;
 
 const MAGIC: [u8; 8] = *b"SPLATMAP";
 const VERSION: u32 = 1;
 /// Magic, version, number of sections, CRC32C of these.
 const FILE_HEADER_BYTES: u64 = 20;
-/// Tag, length, and behind the content the CRC32C of all three.
-const SECTION_FRAME_BYTES: u64 = 16;
 /// Far more than the format knows; keeps a made-up count from looping.
 const MAX_SECTIONS: u32 = 64;
 
@@ -31,9 +32,9 @@ const META: [u8; 4] = *b"META";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
 const SPLATS: [u8; 4] = *b"SPLT";
 const LANDMARKS: [u8; 4] = *b"LAND";
-
-/// Bytes of one keyframe: id, stamp, quaternion, translation, picture size, focal lengths, principal point.
-const KEYFRAME_BYTES: usize = 4 + 8 + 4 * 8 + 3 * 8 + 2 * 4 + 4 * 8;
+const AGES: [u8; 4] = *b"AGES";
+const VIEWS: [u8; 4] = *b"VIEW";
+const EVICTED: [u8; 4] = *b"EVIC";
 
 /// All that a later run needs to show, export or continue a map.
 #[derive(Debug, Clone)]
@@ -44,6 +45,30 @@ pub struct Checkpoint {
     pub steps: u64,
     /// Landmarks by which a later run finds its place, as `track::Tracker` saves them; empty where there are none.
     pub landmarks: Vec<u8>,
+    /// Updates that each splat has had, in their order; empty where unknown.
+    pub ages: Vec<u16>,
+    /// Pictures of keyframes, to train on again.
+    pub views: Vec<SavedView>,
+    /// So many bytes of them are written at most.
+    pub max_view_bytes: u64,
+    /// Parts of the map that are on disk, not among the snapshot's splats. What was read has none: they are among them.
+    pub evicted: Vec<Evicted>,
+}
+
+impl Checkpoint {
+    /// Without what makes it quicker to go on.
+    pub fn of(snapshot: Snapshot, seed: u64, steps: u64) -> Self {
+        Self {
+            snapshot,
+            seed,
+            steps,
+            landmarks: Vec::new(),
+            ages: Vec::new(),
+            views: Vec::new(),
+            max_view_bytes: 0,
+            evicted: Vec::new(),
+        }
+    }
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -62,33 +87,38 @@ pub enum CheckpointError {
 
 /// Writes beside `path` and renames: a crash at any point leaves the old file or the new one.
 pub fn write(checkpoint: &Checkpoint, path: &Path) -> Result<(), CheckpointError> {
+    let fail = |e: io::Error| CheckpointError::Write {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    };
     let snapshot = &checkpoint.snapshot;
+    let views = view_bytes(&checkpoint.views, checkpoint.max_view_bytes).map_err(fail)?;
     let sections = [
         (META, meta_bytes(checkpoint)),
         (KEYFRAMES, keyframe_bytes(&snapshot.poses)),
         (SPLATS, splat_bytes(&snapshot.splats)),
         (LANDMARKS, checkpoint.landmarks.clone()),
+        (AGES, age_bytes(&checkpoint.ages)),
+        (VIEWS, views),
     ];
     crate::atomic::write_file(path, |file| {
         let mut header = Vec::with_capacity(FILE_HEADER_BYTES as usize);
         header.extend_from_slice(&MAGIC);
         header.extend_from_slice(&VERSION.to_le_bytes());
-        header.extend_from_slice(&(sections.len() as u32).to_le_bytes());
+        header.extend_from_slice(&(sections.len() as u32 + 1).to_le_bytes());
         file.write_all(&header)?;
         file.write_u32::<LittleEndian>(crc32c::crc32c(&header))?;
         for (tag, content) in &sections {
-            let length = (content.len() as u64).to_le_bytes();
-            file.write_all(tag)?;
-            file.write_all(&length)?;
-            file.write_all(content)?;
-            file.write_u32::<LittleEndian>(section_crc(*tag, length, content))?;
+            write_section(file, *tag, content.len() as u64, &|file| {
+                file.write_all(content)
+            })?;
         }
-        Ok(())
+        let evicted = &checkpoint.evicted;
+        write_section(file, EVICTED, regions_len(evicted), &|file| {
+            write_regions(evicted, file)
+        })
     })
-    .map_err(|e| CheckpointError::Write {
-        reason: e.to_string(),
-        path: path.to_owned(),
-    })
+    .map_err(fail)
 }
 
 /// Reads and checks a whole file. Sections that this version does not know are checked and left out.
@@ -115,6 +145,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     let n_sections = read_header(&mut file, path)?;
     let mut remaining_bytes = file_info.len() - FILE_HEADER_BYTES;
     let (mut meta, mut keyframes, mut splats, mut landmarks) = (None, None, None, None);
+    let (mut ages, mut views, mut evicted) = (None, None, None);
     for section_ix in 0..n_sections {
         let (tag, content) = match read_section(&mut file, &mut remaining_bytes) {
             Ok(Ok(section)) => section,
@@ -126,6 +157,9 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
             KEYFRAMES => fill_once(&mut keyframes, parse_keyframes(&content)),
             SPLATS => fill_once(&mut splats, parse_splats(&content)),
             LANDMARKS => fill_once(&mut landmarks, Ok(content)),
+            AGES => fill_once(&mut ages, parse_ages(&content)),
+            VIEWS => fill_once(&mut views, parse_views(&content)),
+            EVICTED => fill_once(&mut evicted, parse_regions(&content)),
             _ => Ok(()),
         };
         known.map_err(|reason| damaged(format!("section {}: {reason}", tag.escape_ascii())))?;
@@ -138,21 +172,54 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     let missing = |name: &str| damaged(format!("no section {name}"));
     let meta: Meta = meta.ok_or_else(|| missing("META"))?;
     let splats = splats.ok_or_else(|| missing("SPLT"))?;
+    let (splats, ages) = joined(
+        splats,
+        ages.unwrap_or_default(),
+        evicted.unwrap_or_default(),
+    )
+    .map_err(&damaged)?;
+    let snapshot = Snapshot {
+        map_id: meta.map_id,
+        epoch: meta.epoch,
+        revision: meta.revision,
+        stamp: meta.stamp,
+        scale: meta.scale,
+        poses: keyframes.ok_or_else(|| missing("KEYF"))?,
+        splat_ids: Arc::new((0..splats.len() as u32).collect()),
+        splats: Arc::new(splats),
+    };
     Ok(Checkpoint {
-        snapshot: Snapshot {
-            map_id: meta.map_id,
-            epoch: meta.epoch,
-            revision: meta.revision,
-            stamp: meta.stamp,
-            scale: meta.scale,
-            poses: keyframes.ok_or_else(|| missing("KEYF"))?,
-            splat_ids: Arc::new((0..splats.len() as u32).collect()),
-            splats: Arc::new(splats),
-        },
-        seed: meta.seed,
-        steps: meta.steps,
         landmarks: landmarks.unwrap_or_default(),
+        ages,
+        views: views.unwrap_or_default(),
+        ..Checkpoint::of(snapshot, meta.seed, meta.steps)
     })
+}
+
+/// All splats, those that were on disk behind the others, and their ages, or none.
+fn joined(
+    mut splats: Splats,
+    mut ages: Vec<u16>,
+    evicted: Vec<(Splats, Vec<u16>)>,
+) -> Result<(Splats, Vec<u16>), String> {
+    if !ages.is_empty() && ages.len() != splats.len() {
+        return Err(format!(
+            "ages of {} splats for {}",
+            ages.len(),
+            splats.len()
+        ));
+    }
+    if !evicted.is_empty() {
+        ages.resize(splats.len(), 0);
+    }
+    for (more, more_ages) in evicted {
+        if more.sh_degree != splats.sh_degree && !splats.is_empty() {
+            return Err("splats of two SH degrees".to_owned());
+        }
+        splats.extend(&more);
+        ages.extend(more_ages);
+    }
+    Ok((splats, ages))
 }
 
 /// The content of META.
@@ -199,41 +266,6 @@ fn read_header(file: &mut File, path: &Path) -> Result<u32, CheckpointError> {
         });
     }
     Ok(n_sections)
-}
-
-type Section = ([u8; 4], Vec<u8>);
-
-/// The outer result is the disk's, the inner one the format's.
-fn read_section(file: &mut File, remaining_bytes: &mut u64) -> io::Result<Result<Section, String>> {
-    if *remaining_bytes < SECTION_FRAME_BYTES {
-        return Ok(Err(format!(
-            "the file ends, {remaining_bytes} bytes are left"
-        )));
-    }
-    let mut tag = [0; 4];
-    file.read_exact(&mut tag)?;
-    let mut length = [0; 8];
-    file.read_exact(&mut length)?;
-    let n_bytes = u64::from_le_bytes(length);
-    *remaining_bytes -= SECTION_FRAME_BYTES;
-    if n_bytes > *remaining_bytes {
-        return Ok(Err(format!(
-            "{n_bytes} bytes announced, {remaining_bytes} are left"
-        )));
-    }
-    *remaining_bytes -= n_bytes;
-    let mut content = vec![0; n_bytes as usize];
-    file.read_exact(&mut content)?;
-    let crc = file.read_u32::<LittleEndian>()?;
-    if crc != section_crc(tag, length, &content) {
-        return Ok(Err(format!("the CRC of its {n_bytes} bytes does not fit")));
-    }
-    Ok(Ok((tag, content)))
-}
-
-fn section_crc(tag: [u8; 4], length: [u8; 8], content: &[u8]) -> u32 {
-    let frame = crc32c::crc32c_append(crc32c::crc32c(&tag), &length);
-    crc32c::crc32c_append(frame, content)
 }
 
 fn fill_once<T>(slot: &mut Option<T>, parsed: Result<T, String>) -> Result<(), String> {
@@ -291,103 +323,4 @@ fn parse_meta(content: &[u8]) -> Result<Meta, String> {
     let scale = Scale::of_numbers(numbers)
         .ok_or_else(|| format!("scale (source, metres, deviation) {numbers:?} is none"))?;
     Ok(Meta { scale, ..meta })
-}
-
-fn keyframe_bytes(poses: &[KeyframePose]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(poses.len() * KEYFRAME_BYTES);
-    for pose in poses {
-        let (q, t, k) = (
-            pose.map_from_cam.rotation,
-            pose.map_from_cam.translation,
-            &pose.intrinsics,
-        );
-        bytes.extend_from_slice(&pose.keyframe_id.to_le_bytes());
-        bytes.extend_from_slice(&pose.stamp.nanos.to_le_bytes());
-        for number in [q.w, q.x, q.y, q.z, t.x, t.y, t.z] {
-            bytes.extend_from_slice(&number.to_le_bytes());
-        }
-        bytes.extend_from_slice(&k.width_px.to_le_bytes());
-        bytes.extend_from_slice(&k.height_px.to_le_bytes());
-        for number in [k.fx, k.fy, k.cx, k.cy] {
-            bytes.extend_from_slice(&number.to_le_bytes());
-        }
-    }
-    bytes
-}
-
-fn parse_keyframes(content: &[u8]) -> Result<Vec<KeyframePose>, String> {
-    let (rows, rest) = content.as_chunks::<KEYFRAME_BYTES>();
-    if !rest.is_empty() {
-        return Err(format!(
-            "{} bytes are no whole number of keyframes of {KEYFRAME_BYTES}",
-            content.len()
-        ));
-    }
-    let mut poses = Vec::with_capacity(rows.len());
-    for row in rows {
-        let pose = parse_keyframe(row).map_err(|e| e.to_string())?;
-        let lengths_fit = (pose.map_from_cam.rotation.length() - 1.0).abs() < 1e-6;
-        if !pose.map_from_cam.is_finite() || !lengths_fit || !pose.intrinsics.is_plausible() {
-            return Err(format!(
-                "keyframe {} has no usable pose or intrinsics",
-                pose.keyframe_id
-            ));
-        }
-        poses.push(pose);
-    }
-    Ok(poses)
-}
-
-fn parse_keyframe(mut row: &[u8]) -> io::Result<KeyframePose> {
-    let keyframe_id = row.read_u32::<LittleEndian>()?;
-    let stamp = Stamp::from_nanos(row.read_i64::<LittleEndian>()?);
-    let mut numbers = [0.0; 7];
-    row.read_f64_into::<LittleEndian>(&mut numbers)?;
-    let [w, x, y, z, tx, ty, tz] = numbers;
-    let (width_px, height_px) = (
-        row.read_u32::<LittleEndian>()?,
-        row.read_u32::<LittleEndian>()?,
-    );
-    let mut numbers = [0.0; 4];
-    row.read_f64_into::<LittleEndian>(&mut numbers)?;
-    let [fx, fy, cx, cy] = numbers;
-    Ok(KeyframePose {
-        keyframe_id,
-        stamp,
-        map_from_cam: Rigid::new(DQuat::from_xyzw(x, y, z, w), DVec3::new(tx, ty, tz)),
-        intrinsics: Intrinsics {
-            width_px,
-            height_px,
-            fx,
-            fy,
-            cx,
-            cy,
-        },
-    })
-}
-
-fn splat_bytes(splats: &Splats) -> Vec<u8> {
-    let mut bytes =
-        Vec::with_capacity(4 + splats.len() * layout::bytes_per_splat(splats.sh_degree));
-    bytes.extend_from_slice(&u32::from(splats.sh_degree).to_le_bytes());
-    layout::encode(splats, 0..splats.len(), &mut bytes);
-    bytes
-}
-
-fn parse_splats(content: &[u8]) -> Result<Splats, String> {
-    let (head, body) = content.split_first_chunk::<4>().ok_or("no SH degree")?;
-    let sh_degree = u32::from_le_bytes(*head);
-    let sh_degree = u8::try_from(sh_degree)
-        .ok()
-        .filter(|degree| *degree <= layout::MAX_SH_DEGREE);
-    let mut splats = Splats {
-        sh_degree: sh_degree.ok_or("its SH degree is above 3")?,
-        ..Splats::default()
-    };
-    layout::decode(body, &mut splats)
-        .ok_or_else(|| format!("{} bytes are no whole number of splats", body.len()))?;
-    match layout::fault(&splats) {
-        Some(reason) => Err(reason),
-        None => Ok(splats),
-    }
 }

@@ -29,7 +29,7 @@ impl SplatMap {
         let map_poses = self.engine.poses();
         let focal_factor = self.engine.focal_factor();
         for placed in self.keyframes.placed.values_mut() {
-            if placed.n_depth_looks >= N_LOOKS || placed.is_held_out {
+            if placed.n_depth_looks >= N_LOOKS || placed.is_held_out || !placed.home.is_here {
                 continue;
             }
             placed.n_depth_looks += 1;
@@ -59,7 +59,7 @@ impl Placed {
 }
 
 /// Median of rendered over given depth, weighted by confidence: the factor of least absolute error, in closed form.
-fn factor(depth: &DepthMap, rendering: &Rendering) -> Option<f32> {
+pub(super) fn factor(depth: &DepthMap, rendering: &Rendering) -> Option<f32> {
     let (width, height) = (depth.width_px as usize, depth.height_px as usize);
     let (shown_width, shown_height) = (rendering.width_px as usize, rendering.height_px as usize);
     let mut ratios = Vec::new();

@@ -104,10 +104,11 @@ impl SplatMap {
     }
 
     /// After splats were added.
-    fn number_splats(&mut self) {
+    pub(super) fn number_splats(&mut self) {
         if self.ids.grow_to(self.engine.n_splats()) {
             self.epoch += 1;
         }
+        self.note_peaks();
     }
 
     pub(super) fn retain(&mut self, keep: &[bool]) {
@@ -125,9 +126,35 @@ impl SplatMap {
     }
 
     /// While the end is known to be far, part of the room is kept for what is still to be seen.
-    fn cap(&self) -> usize {
+    fn cap(&mut self) -> usize {
+        let most = self.most_splats();
         let share = self.progress.map_or(1.0, |p| (FIRST_ROOM + p).min(1.0));
-        (self.params.max_splats as f64 * share) as usize
+        // What a saved map brought needs no share.
+        let before = self.past.as_ref().map_or(0, |past| past.n_splats.min(most));
+        before + ((most - before) as f64 * share) as usize
+    }
+
+    /// What the budgets allow in all.
+    pub(super) fn most_splats(&mut self) -> usize {
+        let by_number = self.params.max_splats;
+        if self.params.max_gpu_mib == 0 {
+            return by_number;
+        }
+        let by_bytes = {
+            let budget = self.params.max_gpu_mib << 20;
+            let kept = self.bytes_for_views();
+            self.engine.room_within(budget.saturating_sub(kept))
+        };
+        if by_bytes < by_number && self.engine.n_splats() >= by_bytes {
+            if self.peaks.n_refused == 0 {
+                tracing::warn!(
+                    "map.max_gpu_mib = {} has room for {by_bytes} splats of map.max_splats = {by_number}: no more are added; said once",
+                    self.params.max_gpu_mib
+                );
+            }
+            self.peaks.n_refused += 1;
+        }
+        by_number.min(by_bytes)
     }
 
     /// A keyframe's camera as it is refined by now.
@@ -152,6 +179,9 @@ impl SplatMap {
         let rendering = camera.and_then(|camera| self.shown(&camera, self.params.sh_degree));
         let placed = self.keyframes.placed.get(&keyframe_id);
         if let Some((placed, rendering)) = placed.zip(rendering) {
+            if placed.image.is_hollow() {
+                return;
+            }
             let mask = transient::mask(&placed.image, &rendering, self.params.transient);
             self.engine.set_mask(placed.view_ix, mask);
         }

@@ -23,7 +23,12 @@ impl SplatMap {
         self.note_loss();
         self.place_held_out();
         let last = self.step_settings(Phase::Final(1.0));
-        for view_ix in self.held_out() {
+        for id in self.held_out() {
+            let was_here = self.is_here(id);
+            if !self.visit(id) {
+                continue;
+            }
+            let view_ix = self.keyframes.placed[&id].view_ix;
             for step in 0..STEPS {
                 let rate = RATE * FINAL_RATE.powf(step as f32 / STEPS as f32);
                 let settings = StepSettings {
@@ -41,17 +46,21 @@ impl SplatMap {
                 };
                 self.engine.step(view_ix, &settings);
             }
+            if !was_here {
+                self.leave(id);
+            }
         }
         // These steps are no training: their losses must not enter the curve.
         self.engine.take_stats();
     }
 
-    /// How far the geometry can trust each keyframe's pose; lengths in the map's unit.
+    /// How far the geometry can trust the pose of each keyframe of this run; lengths in the map's unit.
     pub fn health(&mut self) -> Vec<(u32, Stamp, Health)> {
         let map_poses = self.engine.poses();
         let scale = self.map_from_model(&map_poses).scale;
         let placed = self.keyframes.placed.iter();
         placed
+            .filter(|(_, placed)| !placed.home.is_past)
             .map(|(id, placed)| {
                 (
                     *id,
@@ -73,16 +82,30 @@ impl SplatMap {
 
     /// What the map shows from a keyframe, beside the picture that was taken there.
     pub fn render_keyframe(&mut self, keyframe_id: u32) -> Option<(Rendering, Arc<RgbImage>)> {
+        let was_here = self.is_here(keyframe_id);
+        if !self.visit(keyframe_id) {
+            return None;
+        }
         let image = Arc::clone(&self.keyframes.placed.get(&keyframe_id)?.image);
         let (intrinsics, cam_from_map) = self.camera(keyframe_id)?;
         let sh_degree = self.params.sh_degree;
         let rendering = self.engine.render(&intrinsics, &cam_from_map, sh_degree);
+        if !was_here {
+            self.leave(keyframe_id);
+        }
         Some((rendering, image))
     }
 
-    fn held_out(&self) -> Vec<usize> {
-        let held_out = self.keyframes.placed.values().filter(|p| p.is_held_out);
-        held_out.map(|p| p.view_ix).collect()
+    /// Those that show nothing that is on disk.
+    fn held_out(&self) -> Vec<u32> {
+        let placed = self.keyframes.placed.iter();
+        let held_out = placed.filter(|(_, p)| p.is_held_out && !p.home.rests);
+        held_out.map(|(id, _)| *id).collect()
+    }
+
+    fn is_here(&self, keyframe_id: u32) -> bool {
+        let placed = self.keyframes.placed.get(&keyframe_id);
+        placed.is_some_and(|p| p.home.is_here)
     }
 
     /// The other cameras may have moved together since these were placed among them.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::camera::{Intrinsics, Lens};
 use crate::frame::{DepthMap, Keyframe, RgbImage};
 use crate::geometry::{Health, View};
+use crate::map::resting::Home;
 use crate::pose::Rigid;
 use crate::source::rectify::Rectifier;
 
@@ -34,6 +35,7 @@ pub struct Placed {
     pub health: Health,
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,
+    pub home: Home,
 }
 
 /// Everything that has come and may still be used, by keyframe id.
@@ -86,16 +88,21 @@ impl Keyframes {
 
 /// The keyframe's picture at most `max_side` pixels long, as the view's pinhole sees it, and that pinhole.
 pub fn picture(keyframe: &Keyframe, view: &View, max_side: u32) -> (Arc<RgbImage>, Intrinsics) {
-    let image = keyframe.frame.image.shrunk(max_side);
+    let full = &keyframe.frame.image;
+    let image = if full.width_px.max(full.height_px) <= max_side {
+        Arc::clone(full)
+    } else {
+        Arc::new(full.shrunk(max_side))
+    };
     let size = (image.width_px, image.height_px);
     let pinhole = view.intrinsics.resized(size.0, size.1);
     let lens = view.lens.map(|lens| lens.resized(size.0, size.1));
     let rectifier = lens.and_then(|lens| Rectifier::onto(&pinhole, &lens));
     let straight = match rectifier {
-        Some(rectifier) => rectifier.rectify(image),
+        Some(rectifier) => Arc::new(rectifier.rectify(Arc::unwrap_or_clone(image))),
         None => image,
     };
-    (Arc::new(straight), pinhole)
+    (straight, pinhole)
 }
 
 /// The same depth in another unit.

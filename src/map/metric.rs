@@ -173,7 +173,7 @@ fn of_baseline(poses: &[KeyframePose], (from, to, metres): (f64, f64, f64)) -> O
 
 impl Placed {
     /// Logarithms of metres per map unit by this keyframe's own depth: as a depth camera has it, and over the floor.
-    fn measure(&mut self, params: &ScaleParams) {
+    pub(super) fn measure(&mut self, params: &ScaleParams) {
         let units = &self.depth;
         if self.ratios.is_some() || units.width_px == 0 {
             return;
@@ -217,6 +217,16 @@ impl SplatMap {
             .into_iter()
             .filter_map(|(source, estimate)| Some((source, estimate?)))
             .min_by(|a, b| a.1.std.total_cmp(&b.1.std));
+        // What a saved map knows better stays.
+        let known = self
+            .past
+            .as_ref()
+            .and_then(|past| past.scale.relative_std());
+        if let Some(known) = known
+            && best.is_none_or(|(_, estimate)| known <= estimate.std)
+        {
+            return self.past.as_ref().map_or(self.scale, |past| past.scale);
+        }
         let scale = best.map_or(Scale::UP_TO_SCALE, |(source, estimate)| {
             let metres = estimate.log.exp();
             Scale {

@@ -7,37 +7,51 @@ pub mod align;
 pub mod checkpoint;
 pub mod correction;
 mod depth_scale;
+pub mod figures;
+mod framing;
 mod gauge;
 mod growth;
 mod held_out;
 mod ids;
 pub mod keyframes;
+mod laid_over;
 pub mod layout;
 mod matches;
 mod metric;
+pub mod past;
+mod regions;
+pub mod resting;
 mod revise;
+pub mod saved_view;
+mod saving;
 pub mod schedule;
+mod sections;
 pub mod seed;
 mod settle;
 pub mod slew;
 pub mod snapshot;
+pub mod spill;
 mod transient;
 mod views;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use sha2::{Digest, Sha256};
 
 use crate::config::MapParams;
 use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
 use crate::map::correction::Correction;
+use crate::map::figures::Peaks;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::ids::SplatIds;
 use crate::map::keyframes::{Keyframes, Placed};
+use crate::map::past::Past;
+use crate::map::regions::Regions;
+use crate::map::resting::{Disk, Home, TURN_EVERY};
 use crate::map::schedule::{Phase, Schedule};
 use crate::map::settle::Settling;
 use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
@@ -48,9 +62,8 @@ pub const MAX_WAITING: usize = 200;
 /// Steps between looks at a view for holes and errors, and between removals of transparent splats.
 const RESEED_EVERY: u64 = 50;
 const PRUNE_EVERY: u64 = 400;
-/// Steps between points of the loss curve at first, and the points beyond which the distance doubles.
+/// Steps between points of the loss curve at first.
 const FIRST_NOTE_EVERY: u64 = 20;
-const MAX_CURVE: usize = 400;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to settle.
 const LAST_RESEED: f32 = 0.6;
 /// All splats and poses, and the engine that improves them.
@@ -82,6 +95,15 @@ pub struct SplatMap {
     epoch: u32,
     revision: u32,
     n_steps: u64,
+    /// The map that this one goes on from.
+    past: Option<Past>,
+    /// The model's lengths are metres.
+    knows_metres: bool,
+    /// What memory has no room for: splats, and pictures, both in a file in `folder`.
+    regions: Regions,
+    disk: Disk,
+    folder: Option<PathBuf>,
+    peaks: Peaks,
     loss_curve: Vec<(u64, f64)>,
     /// Steps between points of the curve.
     note_every: u64,
@@ -118,6 +140,12 @@ impl SplatMap {
             epoch: 0,
             revision: 0,
             n_steps: 0,
+            past: None,
+            knows_metres: scale == Scale::GIVEN,
+            regions: Regions::default(),
+            disk: Disk::default(),
+            folder: None,
+            peaks: Peaks::default(),
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
             settling: Settling::default(),
@@ -136,6 +164,7 @@ impl SplatMap {
             self.keyframes.remember(&batch.keyframes, MAX_WAITING);
         }
         self.progress = progress;
+        self.look_for_past(batch, &geometry);
         self.hold_gauge();
         self.revise(&geometry);
         self.note_sightings(geometry.sightings);
@@ -149,10 +178,16 @@ impl SplatMap {
                 self.keyframes.foreign.insert(view.keyframe_id, view);
             }
         }
-        own.extend(self.take_over());
+        own.extend(if self.past.is_some() {
+            self.join_past()
+        } else {
+            self.take_over()
+        });
         let fresh = self.place(own, geometry.pose_error);
+        self.hold_keyframes(0);
         self.match_views();
         self.set_gauge();
+        self.note_peaks();
         fresh
     }
 
@@ -161,6 +196,9 @@ impl SplatMap {
     pub fn step(&mut self, n: u64, phase: Phase) -> u64 {
         if phase != Phase::Streaming {
             self.progress = None;
+        }
+        if self.waits_for_place() {
+            return 0;
         }
         for done in 0..n {
             let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
@@ -182,6 +220,10 @@ impl SplatMap {
             let may_move = may_change && self.params.mcmc && self.n_steps >= self.params.mcmc_start;
             if may_move && self.n_steps.is_multiple_of(self.params.mcmc_every) {
                 self.relocate();
+            }
+            if self.n_steps.is_multiple_of(TURN_EVERY) {
+                self.take_turns();
+                self.note_peaks();
             }
             if self.n_steps.is_multiple_of(GAUGE_EVERY) {
                 if settings.pose != PoseStep::Held {
@@ -208,7 +250,7 @@ impl SplatMap {
                 intrinsics: placed.intrinsics.refocused(focal_factor),
             })
             .collect();
-        self.scale = self.measure_scale(&poses);
+        self.scale = self.measure_scale(self.own(&poses));
         self.revision += 1;
         let (splats, splat_ids) = self.finite_splats();
         Arc::new(Snapshot {
@@ -223,11 +265,12 @@ impl SplatMap {
         })
     }
 
-    /// (id, is held out) of every keyframe in the map.
+    /// (id, is held out) of every keyframe in the map that has a picture, and nothing on disk of what it shows.
     pub fn keyframe_ids(&self) -> Vec<(u32, bool)> {
         self.keyframes
             .placed
             .iter()
+            .filter(|(_, p)| (p.home.is_here || p.home.copy.is_some()) && !p.home.rests)
             .map(|(id, placed)| (*id, placed.is_held_out))
             .collect()
     }
@@ -281,21 +324,6 @@ impl SplatMap {
         schedule::settings(&self.params, self.scene_depth, self.pose_error, phase)
     }
 
-    fn map_id(&self) -> [u8; 16] {
-        let first = self
-            .keyframes
-            .placed
-            .values()
-            .next()
-            .map(|p| p.keyframe.frame.stamp.nanos)
-            .unwrap_or(0);
-        let digest = Sha256::new()
-            .chain_update(self.seed.to_le_bytes())
-            .chain_update(first.to_le_bytes())
-            .finalize();
-        std::array::from_fn(|i| digest[i])
-    }
-
     /// Gives views of the map's own component their place, and seeds splats from them.
     fn place(&mut self, views: Vec<View>, pose_error: PoseError) -> Vec<u32> {
         if views.is_empty() {
@@ -306,28 +334,15 @@ impl SplatMap {
         self.pose_error[1] =
             self.pose_error[1].max((pose_error.translation * map_from_model.scale) as f32);
         self.pose_error[0] = self.pose_error[0].max(pose_error.rotation_rad as f32);
+        self.hold_keyframes(self.n_unplaced(&views));
         let mut fresh = Vec::new();
         for view in views {
             let given = self.keyframes.placed.get(&view.keyframe_id);
             let factor = map_from_model.scale * given.map_or(1.0, |placed| placed.depth_factor);
             let depth = Arc::new(keyframes::rescaled(&view.depth, factor));
             let median_depth = depth.median();
-            if let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) {
-                if placed.lens != view.lens {
-                    let max_side = self.params.max_side;
-                    let (image, pinhole) = keyframes::picture(&placed.keyframe, &view, max_side);
-                    (placed.image, placed.intrinsics) = (Arc::clone(&image), pinhole);
-                    placed.lens = view.lens;
-                    self.engine.set_image(placed.view_ix, image, &pinhole);
-                }
-                // A shared keyframe: more neighbours have verified its depth since, unless it is out of reach.
-                if depth.width_px > 0 {
-                    self.engine
-                        .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
-                    (placed.depth, placed.median_depth) = (depth, median_depth);
-                    placed.ratios = None;
-                }
-                placed.health = view.health;
+            if self.has_keyframe(view.keyframe_id) {
+                self.told_again(&view, depth);
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
                 let (image, intrinsics) =
                     keyframes::picture(&keyframe, &view, self.params.max_side);
@@ -361,6 +376,7 @@ impl SplatMap {
                         ratios: None,
                         health: view.health,
                         is_held_out,
+                        home: Home::here(),
                     },
                 );
                 if !is_held_out {
@@ -374,22 +390,10 @@ impl SplatMap {
         if !fresh.is_empty() {
             self.unsettle();
         }
+        self.balance(fresh.len() * self.params.seeds_per_keyframe);
         for id in &fresh {
             self.seed_from(*id, false);
         }
         fresh
-    }
-
-    fn measure_scene(&mut self) {
-        let mut medians: Vec<f32> = self
-            .keyframes
-            .placed
-            .values()
-            .filter_map(|p| p.median_depth)
-            .collect();
-        medians.sort_by(f32::total_cmp);
-        if let Some(median) = medians.get(medians.len() / 2) {
-            self.scene_depth = *median;
-        }
     }
 }

@@ -1,6 +1,6 @@
 //! Losses of steps -> a curve of bounded length, and whether more steps on the same views would still pay.
 
-use crate::map::{MAX_CURVE, SplatMap};
+use crate::map::SplatMap;
 
 /// Losses are compared between stretches of so many steps per view: single views differ too much.
 const STEPS_PER_VIEW: u64 = 6;
@@ -21,7 +21,7 @@ pub(super) struct Settling {
 
 impl Settling {
     /// `loss` is the mean of `n_steps` steps.
-    fn note(&mut self, loss: f64, n_steps: u64, n_views: usize) {
+    pub(super) fn note(&mut self, loss: f64, n_steps: u64, n_views: usize) {
         self.sum += loss * n_steps as f64;
         self.n_steps += n_steps;
         if self.n_steps < (STEPS_PER_VIEW * n_views as u64).max(MIN_STRETCH) {
@@ -52,24 +52,6 @@ impl SplatMap {
     /// There is something to learn.
     pub(super) fn unsettle(&mut self) {
         self.settling = Settling::default();
-    }
-
-    pub(super) fn note_loss(&mut self) {
-        let stats = self.engine.take_stats();
-        if stats.n_steps > 0 {
-            self.loss_curve.push((self.n_steps, stats.loss));
-            self.settling
-                .note(stats.loss, stats.n_steps, self.trainable.len());
-        }
-        // A live run has no end: half the points at twice the distance show the same curve.
-        if self.loss_curve.len() > MAX_CURVE {
-            let mut odd = false;
-            self.loss_curve.retain(|_| {
-                odd = !odd;
-                odd
-            });
-            self.note_every *= 2;
-        }
     }
 }
 

@@ -86,6 +86,12 @@ impl Scale {
         std: None,
     };
 
+    /// Standard deviation as a share of the scale; `None` where no metres are known.
+    pub fn relative_std(self) -> Option<f64> {
+        let metres = self.metres_per_unit?;
+        Some(self.std.map_or(0.0, |std| std / metres))
+    }
+
     /// As messages and files have it: code, metres and standard deviation, 0 where unknown.
     pub fn to_numbers(self) -> (u8, f64, f64) {
         let known = |value: Option<f64>| value.unwrap_or(0.0);

@@ -22,11 +22,14 @@ impl SplatMap {
             map_from_cam: map_poses[placed.view_ix].inverse(),
             intrinsics: placed.intrinsics.refocused(focal_factor),
             lens: placed.lens,
-            depth: Arc::clone(if placed.is_held_out {
-                &no_depth
-            } else {
-                &placed.depth
-            }),
+            // What came with a saved map, or back from disk, has its landmarks already.
+            depth: Arc::clone(
+                if placed.is_held_out || placed.home.is_past || placed.home.copy.is_some() {
+                    &no_depth
+                } else {
+                    &placed.depth
+                },
+            ),
             covariance: placed.health.rescaled(unit).covariance.or(stated),
         };
         self.keyframes.placed.values().map(view).collect()

@@ -2,15 +2,18 @@
 //!
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
+pub mod autosave;
 pub mod localise;
+mod opening;
 mod outward;
 pub mod pipeline;
 pub mod ros2;
 pub mod run_dir;
 mod stages;
+mod threads;
 pub mod track_stage;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -27,7 +30,7 @@ use crate::geometry::onnx::model::Model;
 use crate::geometry::sfm::Sfm;
 use crate::gpu::device::Wanted;
 use crate::map::SplatMap;
-use crate::map::snapshot::{Scale, Snapshot};
+use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::node::outward::Clerk;
 use crate::node::track_stage::Tracking;
 use crate::pose::Rigid;
@@ -48,6 +51,8 @@ pub struct Job {
     /// A live source drops frames rather than wait, and the map is optimised as long as frames come.
     pub is_live: bool,
     pub stop: Stop,
+    /// Run directory: autosaves go there, and what memory has no room for.
+    pub out: Option<PathBuf>,
     /// The way out, where anything is to go out before the end.
     pub outbox: Option<Arc<Outbox>>,
 }
@@ -68,6 +73,11 @@ pub struct Stop {
 impl Stop {
     pub fn ask(&self) {
         self.is_asked.store(true, Ordering::Relaxed);
+    }
+
+    /// For sources, which know no nodes.
+    pub fn flag(&self) -> &Arc<AtomicBool> {
+        &self.is_asked
     }
 
     /// Ends this map for a fresh one from the same source.
@@ -132,6 +142,13 @@ pub struct Outcome {
     /// Stays up for late joiners until `linger` has closed it.
     pub outbox: Option<Arc<Outbox>>,
     clerk: Clerk,
+}
+
+impl Outcome {
+    /// Keyframes of this run, without those of a saved map.
+    pub fn own_poses(&self) -> &[KeyframePose] {
+        self.map.own(&self.snapshot.poses)
+    }
 }
 
 impl std::fmt::Debug for Outcome {

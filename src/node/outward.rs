@@ -8,9 +8,9 @@ use std::time::Duration;
 use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::export::ply;
-use crate::map::SplatMap;
-use crate::map::checkpoint::{self, Checkpoint};
 use crate::map::snapshot::Snapshot;
+use crate::map::{SplatMap, checkpoint};
+use crate::node::Stop;
 use crate::publish::PublishError;
 use crate::publish::outbox::Outbox;
 use crate::publish::overview::SeenKeyframe;
@@ -20,7 +20,7 @@ use crate::queue::{Received, Receiver};
 use crate::track::Tracker;
 
 /// Transforms go out at least so often: consumers like to look back no further (Nav2: 10 Hz, better 20).
-const REPEAT: Duration = Duration::from_millis(45);
+const REPEAT: Duration = Duration::from_millis(30);
 const STATUS_SECS: f64 = 1.0;
 /// Seconds between words of the same trouble.
 const COMPLAIN_SECS: f64 = 10.0;
@@ -111,18 +111,38 @@ fn publish(outbox: &Outbox, (snapshot, is_last): &Outgoing) -> Result<(), Publis
 /// What calls from outside are answered with, besides the map.
 #[derive(Debug)]
 pub(super) struct Clerk {
+    /// To begin again from a saved map; `None` once the input has ended.
+    stop: Option<Stop>,
+    wanted: String,
     calls: Option<Calls<Call>>,
     track: TrackParams,
-    seed: u64,
+    /// What the tracker tells of its landmarks now and then, and the newest of it.
+    told: Option<Receiver<Vec<u8>>>,
+    landmarks: Vec<u8>,
 }
 
 impl Clerk {
-    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams, seed: u64) -> Self {
+    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams, stop: Stop) -> Self {
         Self {
             calls,
+            stop: Some(stop),
+            wanted: String::new(),
             track: track.clone(),
-            seed,
+            told: None,
+            landmarks: Vec::new(),
         }
+    }
+
+    pub(super) fn hear_landmarks(&mut self, told: Receiver<Vec<u8>>) {
+        self.told = Some(told);
+    }
+
+    /// The newest that the tracker has told; empty before.
+    pub(super) fn landmarks(&mut self) -> &[u8] {
+        while let Some(Ok(Some(newest))) = self.told.as_ref().map(Receiver::try_recv) {
+            self.landmarks = newest;
+        }
+        &self.landmarks
     }
 
     /// Those of the map before, where there are any.
@@ -136,7 +156,7 @@ impl Clerk {
     }
 
     /// Answers what has been asked since.
-    pub(super) fn serve(&self, map: &mut SplatMap) {
+    pub(super) fn serve(&mut self, map: &mut SplatMap) {
         while let Some(call) = self.calls.as_ref().and_then(|calls| calls.try_recv().ok()) {
             let answer = self.answer(map, &call.request);
             if let Answer::Refused(reason) = &answer {
@@ -146,7 +166,7 @@ impl Clerk {
         }
     }
 
-    fn answer(&self, map: &mut SplatMap, request: &Request) -> Answer {
+    fn answer(&mut self, map: &mut SplatMap, request: &Request) -> Answer {
         let done = |what: &str, written: Result<(), String>| match written {
             Ok(()) => Answer::Done(what.to_owned()),
             Err(reason) => Answer::Refused(reason),
@@ -161,9 +181,10 @@ impl Clerk {
                     written.map_err(|e| e.to_string()),
                 )
             }
-            Request::Load(_) => Answer::Refused(
-                "a running map is not replaced: start the node on the saved one".to_owned(),
-            ),
+            Request::Load(path) => match self.load(path) {
+                Ok(()) => Answer::Done("mapping goes on from the saved map".to_owned()),
+                Err(reason) => Answer::Refused(reason),
+            },
             Request::Render {
                 splats_from_cam,
                 intrinsics,
@@ -174,16 +195,42 @@ impl Clerk {
         }
     }
 
-    /// With landmarks, so that a later run finds its place.
-    fn save(&self, map: &mut SplatMap, path: &Path) -> Result<(), String> {
-        let mut tracker = Tracker::new(&self.track);
-        tracker.update(&map.keyframe_views());
-        let saved = Checkpoint {
-            snapshot: (*map.snapshot()).clone(),
-            seed: self.seed,
-            steps: map.n_steps(),
-            landmarks: tracker.saved()?,
+    /// The map that mapping is to go on from after a restart; empty for a fresh one.
+    pub(super) fn take_wanted(&mut self) -> String {
+        std::mem::take(&mut self.wanted)
+    }
+
+    /// No restart from here on: the input has ended.
+    pub(super) fn at_end(mut self) -> Self {
+        self.stop = None;
+        self
+    }
+
+    /// What cannot be read is refused, and the present map goes on.
+    fn load(&mut self, path: &Path) -> Result<(), String> {
+        let Some(stop) = &self.stop else {
+            return Err("the input has ended; start a run on the saved map with --map".to_owned());
         };
-        checkpoint::write(&saved, path).map_err(|e| e.to_string())
+        let saved = checkpoint::read(path).map_err(|e| e.to_string())?;
+        Tracker::in_saved(&saved.landmarks, &self.track)
+            .map_err(|reason| format!("no camera could be found in that map: {reason}"))?;
+        self.wanted = path.to_string_lossy().into_owned();
+        stop.ask_restart();
+        Ok(())
+    }
+
+    /// With landmarks, so that a later run finds its place.
+    fn save(&mut self, map: &mut SplatMap, path: &Path) -> Result<(), String> {
+        let mut landmarks = Vec::new();
+        if map.has_all_pictures() {
+            let mut tracker = Tracker::new(&self.track);
+            tracker.update(&map.keyframe_views());
+            landmarks = tracker.saved()?;
+        }
+        // Keyframes of a saved map, and those on disk, only the tracker remembers.
+        if landmarks.is_empty() {
+            landmarks = self.landmarks().to_vec();
+        }
+        map.save(landmarks, path).map_err(|e| e.to_string())
     }
 }

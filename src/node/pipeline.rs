@@ -4,17 +4,16 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver as Calls;
 use std::time::Duration;
 
-use anyhow::anyhow;
-
 use crate::clock::Stopwatch;
-use crate::frame::{Batch, Frame};
-use crate::geometry::{GeometryBatch, GeometryError};
-use crate::map::SplatMap;
+use crate::frame::Batch;
+use crate::geometry::GeometryError;
 use crate::map::snapshot::Snapshot;
+use crate::node::opening;
 use crate::node::outward::{self, run_live, run_publisher};
 use crate::node::stages::{GeometryStage, MapStage, SelectStage, SourceStage};
-use crate::node::track_stage::{Heard, News, TrackStage, Tracking, policies, run_track, tell};
-use crate::node::{Job, Outcome, Progress, StageSecs, engine, model, spawn};
+use crate::node::threads::{Answer, joined, run_geometry, run_select, run_source};
+use crate::node::track_stage::{News, TrackStage, Tracking, policies, run_track};
+use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::publish::outbox::Outbox;
 use crate::publish::service::Call;
 use crate::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
@@ -30,17 +29,14 @@ const CALL_TICK: Duration = Duration::from_millis(100);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
 const NEWS_SECS: f64 = 1.0;
 
-/// What crosses from geometry to the map; no batch at the model's end.
-type Answer = (Option<Arc<Batch>>, GeometryBatch);
-
 /// Runs a job to its end; a reset on the way throws the map away and goes on with the same source. `on_progress` is
 /// called on this thread.
 pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<Outcome> {
     let watch = Stopwatch::start();
     let mut calls = None;
     loop {
-        let (params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
-        let is_live = job.is_live;
+        let (mut params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
+        let (is_live, out) = (job.is_live, job.out.clone());
         let mut ended = run_once(job, calls.take(), on_progress)?;
         if !stop.takes_restart() {
             let mut outcome = ended.into_outcome(outbox);
@@ -49,12 +45,14 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
         }
         tracing::info!("the map begins again");
         calls = ended.map.clerk.take_calls();
+        params.map.load = ended.map.clerk.take_wanted();
         job = Job {
             source: ended.source.into_source(),
             params,
             is_live,
             stop,
             outbox,
+            out,
         };
     }
 }
@@ -65,27 +63,15 @@ fn run_once(
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
-    let n_frames = job.source.len_hint().filter(|n| *n > 0);
-    let map = SplatMap::new(
-        job.params.map.clone(),
-        job.params.seed,
-        scale,
-        engine(job.params.backend, job.params.deterministic)?,
-    )
-    .measuring_scale(&job.params.scale);
-    let outbox = job.outbox;
-    let mut map = MapStage::new(
+    let opening::Opened {
         map,
-        &job.params,
-        (job.is_live, n_frames),
-        job.stop.clone(),
-        outbox.clone(),
-    );
-    map.clerk.keep_calls(calls);
-    let track = TrackStage::new(&job.params.track, job.is_live);
+        track,
+        first_id,
+    } = opening::open(&job, scale, calls)?;
+    let outbox = job.outbox;
     let stages = Stages {
         map,
-        select: SelectStage::new(&job.params),
+        select: SelectStage::new(&job.params, first_id),
         geometry: GeometryStage::new(model),
         track: track.heard(outbox.is_some()),
         source: SourceStage::new(job.source, job.stop, outbox.clone()),
@@ -291,78 +277,12 @@ impl End {
             tracking: self.tracking,
             keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
-            clerk: self.map.clerk,
+            clerk: self.map.clerk.at_end(),
             map: self.map.map,
             geometry_note: self.geometry.note,
             error: self.error.or(fault),
             outbox,
         }
-    }
-}
-
-fn run_source(
-    mut stage: SourceStage,
-    frames: &Sender<Frame>,
-    heard: Option<&Sender<Heard>>,
-) -> (SourceStage, u64) {
-    while let Some(frame) = stage.next() {
-        tell(heard, &frame);
-        if frames.send(frame).is_err() {
-            break;
-        }
-    }
-    (stage, frames.dropped())
-}
-
-fn run_select(
-    mut stage: SelectStage,
-    frames: &Receiver<Frame>,
-    batches: &Sender<Arc<Batch>>,
-    heard: Option<&Sender<Heard>>,
-) -> SelectStage {
-    // The tracker hears of a batch before geometry does: news of a batch can always be taken, so that nobody waits in
-    // a circle.
-    let send = |batch: Batch| {
-        if let Some(heard) = heard {
-            drop(heard.send(Heard::Batch));
-        }
-        batches.send(Arc::new(batch)).is_ok()
-    };
-    while let Some(frame) = frames.recv() {
-        tell(heard, &frame);
-        if let Some(batch) = stage.push(frame)
-            && !send(batch)
-        {
-            return stage;
-        }
-    }
-    if let Some(batch) = stage.finish() {
-        send(batch);
-    }
-    stage
-}
-
-fn run_geometry(
-    mut stage: GeometryStage,
-    batches: &Receiver<Arc<Batch>>,
-    answers: &Sender<Answer>,
-) -> (GeometryStage, Option<GeometryError>) {
-    while let Some(batch) = batches.recv() {
-        match stage.infer(&batch) {
-            Ok(geometry) => {
-                if answers.send((Some(batch), geometry)).is_err() {
-                    return (stage, None);
-                }
-            }
-            Err(error) => return (stage, Some(error)),
-        }
-    }
-    match stage.finish() {
-        Ok(geometry) => {
-            drop(answers.send((None, geometry)));
-            (stage, None)
-        }
-        Err(error) => (stage, Some(error)),
     }
 }
 
@@ -417,12 +337,4 @@ fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
         // A tracker that is gone is no reason to stop mapping.
         drop(news.send(stage.map.keyframe_views()));
     }
-}
-
-fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
-    thread.join().map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));
-        anyhow!("stage {name} broke: {}", text.unwrap_or_default())
-    })
 }

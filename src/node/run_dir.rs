@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 
 use anyhow::Context;
 use tracing_subscriber::filter::EnvFilter;
@@ -21,14 +21,14 @@ use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
 use crate::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures, percentile,
+    Continued, FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
+    percentile,
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::export::ply;
 use crate::frame::RgbImage;
-use crate::map::checkpoint::{self, Checkpoint};
+use crate::map::checkpoint;
 use crate::map::layout::map_sha256;
-use crate::map::snapshot::Snapshot;
 use crate::memory::peak_rss_mib;
 use crate::node::Outcome;
 use crate::node::track_stage::Tracking;
@@ -101,7 +101,7 @@ pub fn finish(
         None => (Quality::default(), Vec::new()),
     };
     let tracks = &outcome.tracking.tracks.frames;
-    let keyframes = timed_keyframes(&outcome.snapshot);
+    let keyframes = timed_keyframes(outcome);
     let rows = frames::rows(&keyframes, tracks, &outcome.frame_stamps);
     let report = Report {
         tracking: tracking_figures(&outcome.tracking, &rows),
@@ -121,8 +121,10 @@ fn write(
     input: &str,
 ) -> anyhow::Result<()> {
     let health = outcome.map.health();
+    let landmarks = std::mem::take(&mut outcome.tracking.landmarks);
+    let checkpoint = outcome.map.checkpoint(&outcome.snapshot, landmarks);
     let snapshot = &outcome.snapshot;
-    let keyframes = timed_keyframes(snapshot);
+    let keyframes = timed_keyframes(outcome);
     let frames = frames::trajectory(rows);
     let live = frames::live_trajectory(&outcome.tracking.tracks.frames);
     let truth: Vec<TimedPose> = outcome
@@ -143,12 +145,7 @@ fn write(
         trajectory: &frames,
         reference: &truth,
     };
-    let checkpoint = Checkpoint {
-        snapshot: (**snapshot).clone(),
-        seed: report.seed,
-        steps: outcome.map.n_steps(),
-        landmarks: std::mem::take(&mut outcome.tracking.landmarks),
-    };
+
     let results: [anyhow::Result<()>; 9] = [
         write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
         write_health(&health, &out.join("keyframes.csv")).map_err(Into::into),
@@ -176,7 +173,8 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
         frames: FrameCounts::of(&outcome.counts, outcome.n_dropped),
         keyframes: KeyframeCounts {
             selected: outcome.n_selected as u64,
-            registered: snapshot.poses.len() as u64,
+            registered: outcome.own_poses().len() as u64,
+            before: outcome.map.continuation().map_or(0, |c| c.keyframes as u64),
             components: outcome.map.components().len() as u64,
         },
         splats: snapshot.splats.len() as u64,
@@ -207,6 +205,13 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             n_bytes => Some(n_bytes as f64 / (1 << 20) as f64),
         },
         quality,
+        budgets: outcome.map.budgets(),
+        continued: outcome.map.continuation().map(|c| Continued {
+            map_keyframes: c.keyframes as u64,
+            asked: c.asked as u64,
+            found: c.found as u64,
+            joined: c.is_joined,
+        }),
         scale: snapshot.scale.into(),
         source_fault: outcome.counts.fault.clone(),
         geometry_note: outcome.geometry_note.clone(),
@@ -289,12 +294,13 @@ fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-fn timed_keyframes(snapshot: &Arc<Snapshot>) -> Vec<TimedPose> {
+/// Of this run: those of a saved map have stamps of another recording.
+fn timed_keyframes(outcome: &Outcome) -> Vec<TimedPose> {
     let timed = |pose: &crate::map::snapshot::KeyframePose| TimedPose {
         stamp: pose.stamp,
         pose: pose.map_from_cam,
     };
-    snapshot.poses.iter().map(timed).collect()
+    outcome.own_poses().iter().map(timed).collect()
 }
 
 /// `rows` are those of the same run.

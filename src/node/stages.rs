@@ -12,6 +12,7 @@ use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
+use crate::node::autosave::Autosave;
 use crate::node::outward::Clerk;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
@@ -65,6 +66,7 @@ pub(super) struct MapStage {
     outbox: Option<Arc<Outbox>>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
+    pub(super) autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
@@ -93,7 +95,7 @@ impl SourceStage {
             }
             let Some(outbox) = self.outbox.as_ref() else {
                 match polled {
-                    Polled::Frame(frame) => return Some(frame),
+                    Polled::Frame(frame) => return Some(*frame),
                     Polled::Ended => return None,
                     Polled::Waiting => continue,
                 }
@@ -116,7 +118,7 @@ impl SourceStage {
             let is_paused = switches.is_paused.load(Ordering::Relaxed);
             outbox.note(|standing| standing.is_paused = is_paused);
             match polled {
-                Polled::Frame(frame) if !is_paused => return Some(frame),
+                Polled::Frame(frame) if !is_paused => return Some(*frame),
                 Polled::Frame(_) | Polled::Waiting => {}
                 Polled::Ended => {
                     outbox.note(|standing| standing.has_ended = true);
@@ -137,9 +139,9 @@ impl SourceStage {
 }
 
 impl SelectStage {
-    pub(super) fn new(params: &Params) -> Self {
+    pub(super) fn new(params: &Params, first_id: u32) -> Self {
         Self {
-            selector: Selector::new(params.select.clone()),
+            selector: Selector::new(params.select.clone()).counting_from(first_id),
             batcher: Batcher::new(&params.select),
             n_selected: 0,
             frame_stamps: Vec::new(),
@@ -222,11 +224,12 @@ impl MapStage {
             map,
             params: params.map.clone(),
             is_live,
+            clerk: Clerk::new(calls, &params.track, stop.clone()),
             stop,
             n_frames,
-            clerk: Clerk::new(calls, &params.track, params.seed),
             outbox,
             unpublished: BTreeMap::new(),
+            autosave: None,
             since_snapshot: Stopwatch::start(),
             n_keyframes: 0,
             optimise_secs: 0.0,
@@ -302,6 +305,8 @@ impl MapStage {
             self.map.refine_held_out();
         }
         self.optimise_secs += watch.secs();
+        // The last map file must not be overtaken by an older one.
+        self.autosave = None;
         let snapshot = self.snapshot();
         self.note();
         let last = Progress {
@@ -366,6 +371,7 @@ impl MapStage {
             let snapshot = self.snapshot();
             publish(snapshot, self.progress());
         }
+        Autosave::save_if_due(self.autosave.as_mut(), &mut self.map, &mut self.clerk);
     }
 
     fn snapshot(&mut self) -> Arc<Snapshot> {

@@ -18,6 +18,9 @@ const MAX_TIMES: usize = 100_000;
 /// Live, where the queue is never empty: frames after which news of the map are taken in all the same.
 const MAX_FRAMES_WITHOUT_NEWS: usize = 10;
 
+/// Seconds between landmarks for map files that somebody may ask for.
+const TELL_SECS: f64 = 20.0;
+
 /// What the tracker hears, in order.
 pub(super) enum Heard {
     /// A frame, and the time since it came.
@@ -40,6 +43,8 @@ pub(super) struct TrackStage {
     secs: f64,
     frame_secs: VecDeque<f64>,
     latency_secs: VecDeque<f64>,
+    /// Who keeps landmarks for a map file that is written while the run goes on, how often, and since when.
+    saved_to: Option<(Sender<Vec<u8>>, f64, Stopwatch)>,
     /// How the map has moved under the camera since the last frame.
     moved: Option<Similarity>,
     /// The last keyframe whose depth went out.
@@ -78,10 +83,40 @@ impl TrackStage {
             secs: 0.0,
             frame_secs: VecDeque::new(),
             latency_secs: VecDeque::new(),
+            saved_to: None,
             moved: None,
             shown: None,
             events: Vec::new(),
             is_heard: false,
+        }
+    }
+
+    /// Begins in a map that was saved, without an idea of where.
+    pub(super) fn begin_in(&mut self, saved: &[u8], params: &TrackParams) -> anyhow::Result<()> {
+        if self.tracker.is_some() && !saved.is_empty() {
+            let tracker = Tracker::in_saved(saved, params).map_err(anyhow::Error::msg)?;
+            self.tracker = Some(tracker);
+        }
+        Ok(())
+    }
+
+    /// From now on tells landmarks for map files that are written every `secs`; 0: whenever somebody asks.
+    pub(super) fn tell_landmarks(&mut self, secs: f64, to: Sender<Vec<u8>>) {
+        let secs = if secs > 0.0 { secs } else { TELL_SECS };
+        self.saved_to = Some((to, secs, Stopwatch::start()));
+    }
+
+    fn save_if_due(&mut self) {
+        let Some((to, secs, since)) = &mut self.saved_to else {
+            return;
+        };
+        // A little ahead of the map file that they are for.
+        if since.secs() < 0.5 * *secs {
+            return;
+        }
+        *since = Stopwatch::start();
+        if let Some(Ok(landmarks)) = self.tracker.as_ref().map(Tracker::saved) {
+            drop(to.send(landmarks));
         }
     }
 
@@ -145,6 +180,7 @@ impl TrackStage {
         if !self.is_live {
             tracker.look_again(usize::MAX);
         }
+        self.save_if_due();
         self.secs += watch.secs();
         if self.is_heard {
             self.show(news);

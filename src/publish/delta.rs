@@ -90,7 +90,7 @@ impl Published {
             .held
             .as_ref()
             .filter(|held| !is_whole && is_next(held, newest))
-            .and_then(|held| delta(held, newest, max_share));
+            .map(|held| delta(held, newest, max_share));
         match delta {
             Some((after, delta)) => {
                 self.held = Some(Arc::new(after));
@@ -112,8 +112,8 @@ fn is_next(held: &Snapshot, newest: &Snapshot) -> bool {
         && held.scale.source == newest.scale.source
 }
 
-/// The published map after a delta, and the delta; `None` where the whole map is the better choice.
-fn delta(held: &Snapshot, newest: &Snapshot, max_share: f64) -> Option<(Snapshot, Delta)> {
+/// The published map after a delta, and the delta.
+fn delta(held: &Snapshot, newest: &Snapshot, max_share: f64) -> (Snapshot, Delta) {
     let (old_ids, new_ids) = (&held.splat_ids, &newest.splat_ids);
     let mut removed = Vec::new();
     let mut candidates = Vec::new();
@@ -172,7 +172,7 @@ fn delta(held: &Snapshot, newest: &Snapshot, max_share: f64) -> Option<(Snapshot
         removed,
         changed,
     };
-    Some((after, delta))
+    (after, delta)
 }
 
 /// How much of a splat's change a viewer sees.

@@ -31,16 +31,9 @@ impl LiveMessages {
         }
     }
 
-    fn header(&self, stamp: Stamp, frame: &str) -> Header {
-        Header {
-            stamp: stamp.into(),
-            frame_id: frame.to_owned(),
-        }
-    }
-
     pub fn pose(&self, at: &Whereabouts) -> Result<Post, PublishError> {
         let message = PoseWithCovarianceStamped {
-            header: self.header(at.stamp, &self.params.map_frame),
+            header: header(at.stamp, &self.params.map_frame),
             pose: PoseWithCovariance {
                 pose: at.map_from_base.into(),
                 covariance: halves(&at.covariance),
@@ -64,7 +57,7 @@ impl LiveMessages {
             std::array::from_fn(|i| std::array::from_fn(|j| if i == j { value(i) } else { 0.0 }))
         };
         let message = Odometry {
-            header: self.header(at.stamp, &self.params.odom_frame),
+            header: header(at.stamp, &self.params.odom_frame),
             child_frame_id: self.params.base_frame.clone(),
             pose: PoseWithCovariance {
                 pose: at.odom_from_base.into(),
@@ -102,7 +95,7 @@ impl LiveMessages {
                 .saturating_add((params.tf_tolerance * 1e9) as i64),
         );
         let link = |stamp, parent: &str, child: &str, pose: Rigid| TransformStamped {
-            header: self.header(stamp, parent),
+            header: header(stamp, parent),
             child_frame_id: child.to_owned(),
             transform: pose.into(),
         };
@@ -121,6 +114,13 @@ impl LiveMessages {
             ));
         }
         Post::of(&TF, stamp, &TfMessage { transforms }).map(Some)
+    }
+}
+
+fn header(stamp: Stamp, frame: &str) -> Header {
+    Header {
+        stamp: stamp.into(),
+        frame_id: frame.to_owned(),
     }
 }
 

@@ -245,8 +245,7 @@ mod tests {
             intrinsics,
             depth: Arc::new(depth),
         };
-        let params = crate::config::Settings::shipped().params();
-        let cloud = keyframe_cloud(&seen, 2.0, &params.expect("shipped").publish);
+        let cloud = keyframe_cloud(&seen, 2.0, "camera_optical");
         assert_eq!((cloud.width, cloud.row_step), (7, 140));
         let float = |at: usize| {
             f64::from(f32::from_le_bytes(

@@ -207,29 +207,80 @@ impl Standing {
 
 /// The status as `/diagnostics` has it: input, tracking, map.
 pub fn diagnostics(status: &MapperStatus, node: &str, silent_secs: f64) -> DiagnosticArray {
-    let value = |key: &str, value: String| KeyValue {
-        key: key.to_owned(),
-        value,
-    };
-    let part =
-        |name: &str, (level, message): (u8, String), values: Vec<KeyValue>| DiagnosticStatus {
+    let part = |name: &str, (level, message): (u8, String), values: &[(&str, String)]| {
+        let value = |(key, value): &(&str, String)| KeyValue {
+            key: (*key).to_owned(),
+            value: value.clone(),
+        };
+        DiagnosticStatus {
             level,
             name: format!("{node}: {name}"),
             message,
             hardware_id: node.to_owned(),
-            values,
-        };
+            values: values.iter().map(value).collect(),
+        }
+    };
+    let input = [
+        ("frames_received", status.frames_received.to_string()),
+        ("frames_dropped", status.frames_dropped.to_string()),
+        ("frames_undecodable", status.frames_undecodable.to_string()),
+        (
+            "frames_out_of_order",
+            status.frames_out_of_order.to_string(),
+        ),
+        ("frames_queued", status.frames_queued.to_string()),
+    ];
+    let tracking = [
+        ("frames_tracked", status.frames_tracked.to_string()),
+        ("frames_lost", status.frames_lost.to_string()),
+        (
+            "frame_to_pose_p50_ms",
+            status.frame_to_pose_p50_ms.to_string(),
+        ),
+        (
+            "frame_to_pose_p95_ms",
+            status.frame_to_pose_p95_ms.to_string(),
+        ),
+    ];
+    let map = [
+        ("keyframes_selected", status.keyframes_selected.to_string()),
+        ("keyframes_placed", status.keyframes_placed.to_string()),
+        ("components", status.components.to_string()),
+        ("splats", status.splats.to_string()),
+        ("steps", status.steps.to_string()),
+        ("steps_per_s", status.steps_per_s.to_string()),
+        (
+            "keyframe_to_pose_p95_ms",
+            status.keyframe_to_pose_p95_ms.to_string(),
+        ),
+        ("epoch", status.epoch.to_string()),
+        ("revision", status.revision.to_string()),
+        ("rss_mib", status.rss_mib.to_string()),
+        ("gpu_mib", status.gpu_mib.to_string()),
+        ("metres_per_unit", status.metres_per_unit.to_string()),
+    ];
+    let [of_input, of_tracking, of_map] = levels(status, silent_secs);
+    DiagnosticArray {
+        header: Header {
+            frame_id: String::new(),
+            ..status.header.clone()
+        },
+        status: vec![
+            part("input", of_input, &input),
+            part("tracking", of_tracking, &tracking),
+            part("map", of_map, &map),
+        ],
+    }
+}
+
+/// (level, message) of input, tracking and map.
+fn levels(status: &MapperStatus, silent_secs: f64) -> [(u8, String); 3] {
     let is_running = status.state < 4;
+    let silence = format!("no picture for {silent_secs:.1} s");
     let input = match silent_secs {
         _ if !is_running => (DiagnosticStatus::OK, "paused or ended".to_owned()),
-        secs if secs > SILENT_SECS => (
-            DiagnosticStatus::ERROR,
-            format!("no picture for {secs:.1} s"),
-        ),
-        secs if secs > SLOW_SECS => (
-            DiagnosticStatus::WARN,
-            format!("no picture for {secs:.1} s"),
-        ),
+        secs if secs > SILENT_SECS => (DiagnosticStatus::ERROR, silence),
+        secs if secs > SLOW_SECS => (DiagnosticStatus::WARN, silence),
         _ => (DiagnosticStatus::OK, "pictures come".to_owned()),
     };
     let tracking = match status.state {
@@ -241,63 +292,54 @@ pub fn diagnostics(status: &MapperStatus, node: &str, silent_secs: f64) -> Diagn
         None => (DiagnosticStatus::OK, "growing".to_owned()),
         Some(first) => (DiagnosticStatus::WARN, first.clone()),
     };
-    DiagnosticArray {
-        header: Header {
-            frame_id: String::new(),
-            ..status.header.clone()
-        },
-        status: vec![
-            part(
-                "input",
-                input,
-                vec![
-                    value("frames_received", status.frames_received.to_string()),
-                    value("frames_dropped", status.frames_dropped.to_string()),
-                    value("frames_undecodable", status.frames_undecodable.to_string()),
-                    value(
-                        "frames_out_of_order",
-                        status.frames_out_of_order.to_string(),
-                    ),
-                    value("frames_queued", status.frames_queued.to_string()),
-                ],
-            ),
-            part(
-                "tracking",
-                tracking,
-                vec![
-                    value("frames_tracked", status.frames_tracked.to_string()),
-                    value("frames_lost", status.frames_lost.to_string()),
-                    value(
-                        "frame_to_pose_p50_ms",
-                        status.frame_to_pose_p50_ms.to_string(),
-                    ),
-                    value(
-                        "frame_to_pose_p95_ms",
-                        status.frame_to_pose_p95_ms.to_string(),
-                    ),
-                ],
-            ),
-            part(
-                "map",
-                map,
-                vec![
-                    value("keyframes_selected", status.keyframes_selected.to_string()),
-                    value("keyframes_placed", status.keyframes_placed.to_string()),
-                    value("components", status.components.to_string()),
-                    value("splats", status.splats.to_string()),
-                    value("steps", status.steps.to_string()),
-                    value("steps_per_s", status.steps_per_s.to_string()),
-                    value(
-                        "keyframe_to_pose_p95_ms",
-                        status.keyframe_to_pose_p95_ms.to_string(),
-                    ),
-                    value("epoch", status.epoch.to_string()),
-                    value("revision", status.revision.to_string()),
-                    value("rss_mib", status.rss_mib.to_string()),
-                    value("gpu_mib", status.gpu_mib.to_string()),
-                    value("metres_per_unit", status.metres_per_unit.to_string()),
-                ],
-            ),
-        ],
+    [input, tracking, map]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn diagnostics_tell_a_camera_that_stops_from_one_that_runs() {
+        let standing = Standing {
+            tracked: Some(State::Tracking),
+            is_calibrated: true,
+            ..Standing::default()
+        };
+        let level = |silent_secs: f64, standing: &Standing| {
+            let status = standing.message("map", Some(1.0), silent_secs);
+            diagnostics(&status, "mapper", silent_secs).status[0].level
+        };
+        assert_eq!(
+            [0.2, 1.5, 3.5].map(|secs| level(secs, &standing)),
+            [0, 1, 2]
+        );
+        let paused = Standing {
+            is_paused: true,
+            ..standing.clone()
+        };
+        assert_eq!(level(9.0, &paused), DiagnosticStatus::OK);
+        let silent = standing.message("map", None, 5.0);
+        assert!(
+            silent
+                .warnings
+                .iter()
+                .any(|w| w.contains("no picture has come for 5 s"))
+        );
+    }
+
+    #[test]
+    fn percentiles_are_of_the_last_times() {
+        let mut times = Times::default();
+        assert!(times.percentile_ms(0.5).is_nan());
+        for i in 0..3000 {
+            times.note(if i < 2000 {
+                9.0
+            } else {
+                f64::from(i - 2000) * 1e-3
+            });
+        }
+        assert!((times.percentile_ms(0.5) - 500.0).abs() < 0.01);
+        assert!((times.percentile_ms(0.95) - 950.0).abs() < 0.01);
     }
 }

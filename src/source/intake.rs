@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fast_image_resize::images::Image as ResizeImage;
+use fast_image_resize::images::{Image as ResizeImage, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 
 use crate::camera::{Distortion, Intrinsics, Lens};
@@ -14,6 +14,8 @@ use crate::frame::{DepthMap, Frame, RgbImage};
 use crate::pose::Rigid;
 use crate::source::SourceCounts;
 use crate::source::calibration::lens_for_size;
+use crate::source::pixels::resize;
+use crate::source::pool::Pool;
 use crate::source::rectify::Rectifier;
 
 /// Longest wait between two frames of a paced replay, so that a jump of the recording's clock does not stop it.
@@ -54,6 +56,7 @@ pub struct Intake {
     lens: Option<Lens>,
     working: Option<Working>,
     resizer: Resizer,
+    pool: Pool,
     last_stamp: Option<Stamp>,
     n_frames: u64,
     counts: SourceCounts,
@@ -68,6 +71,7 @@ impl Intake {
             lens,
             working: None,
             resizer: Resizer::new(),
+            pool: Pool::default(),
             last_stamp: None,
             n_frames: 0,
             counts: SourceCounts::default(),
@@ -83,6 +87,21 @@ impl Intake {
 
     pub fn counts(&self) -> SourceCounts {
         self.counts.clone()
+    }
+
+    /// A picture to decode into; its size and content are anything.
+    pub fn spare(&mut self) -> RgbImage {
+        self.pool.spare()
+    }
+
+    /// So many pictures were made and never came here.
+    pub fn missed(&mut self, n_pictures: u64) {
+        self.counts.dropped += n_pictures;
+    }
+
+    /// The camera stopped and will be opened again.
+    pub fn interrupted(&mut self) {
+        self.counts.interruptions += 1;
     }
 
     /// Time begins anew: the next picture may have any stamp.
@@ -172,9 +191,14 @@ impl Intake {
         picture: RgbImage,
         extras: Extras,
     ) -> Frame {
-        let small = self.scaled(picture, working.size);
+        let mut small = self.scaled(picture, working.size);
         let image = match &working.rectifier {
-            Some(rectifier) => rectifier.rectify(small),
+            Some(rectifier) => {
+                let mut straight = self.pool.spare();
+                rectifier.rectify_into(&mut small, &mut straight);
+                self.pool.take_back(small);
+                straight
+            }
             None => small,
         };
         let truth_depth = extras
@@ -186,7 +210,7 @@ impl Intake {
         Frame {
             seq: arrival.seq,
             stamp: arrival.stamp,
-            image: Arc::new(image),
+            image: self.pool.lend(image),
             intrinsics: working.intrinsics,
             truth: extras.truth,
             odometry: extras.odometry,
@@ -242,24 +266,25 @@ impl Intake {
         if (picture.width_px, picture.height_px) == size {
             return picture;
         }
-        let source = ResizeImage::from_vec_u8(
+        let mut out = self.pool.spare();
+        resize(&mut out, size.0, size.1);
+        let source = ImageRef::new(
             picture.width_px,
             picture.height_px,
-            picture.pixels,
+            &picture.pixels,
             PixelType::U8x3,
         )
         .expect("three bytes per pixel");
-        let mut target = ResizeImage::new(size.0, size.1, PixelType::U8x3);
+        let mut target =
+            ResizeImage::from_slice_u8(size.0, size.1, &mut out.pixels, PixelType::U8x3)
+                .expect("three bytes per pixel");
         // A box filter would move edges by up to half a pixel at ratios that are not whole.
         let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
         self.resizer
             .resize(&source, &mut target, &options)
             .expect("both pictures are U8x3");
-        RgbImage {
-            width_px: size.0,
-            height_px: size.1,
-            pixels: target.into_vec(),
-        }
+        self.pool.take_back(picture);
+        out
     }
 
     /// Holds a frame back until its time has come.

@@ -10,7 +10,9 @@ use crate::config::SourceParams;
 use crate::frame::{DepthMap, Frame, RgbImage};
 use crate::ros::{self, CompressedImage, Image};
 use crate::source::bag::{Bag, files_of, not_mcap};
+use crate::source::camera_info;
 use crate::source::intake::{Arrival, Extras, Intake};
+use crate::source::jpeg::Jpeg;
 use crate::source::survey::{Survey, header_stamp};
 use crate::source::topics::{depth_topic_of, image_topic_of, lens_of, odometry_of, truth_of};
 use crate::source::truth::{Odometry, Truth, half_interval};
@@ -42,6 +44,7 @@ pub struct McapSource {
     images: VecDeque<Waiting>,
     depths: VecDeque<Waiting>,
     is_read: bool,
+    jpeg: Jpeg,
     intake: Intake,
 }
 
@@ -67,7 +70,10 @@ impl McapSource {
             );
         }
         let depth_topic = depth_topic_of(&survey, params);
-        let lens = lens_of(&survey, &image_topic, params);
+        let lens = match camera_info::of_url(&params.camera_info_url)? {
+            Some(info) => Some(camera_info::lens_of(&info, &params.camera_info_url)?),
+            None => lens_of(&survey, &image_topic, params),
+        };
         let (is_compressed, n_images) = (topic.is_compressed(), topic.n_messages);
         let truth_within_nanos = half_interval(&topic.stamps);
         tracing::info!(
@@ -89,6 +95,7 @@ impl McapSource {
             images: VecDeque::new(),
             depths: VecDeque::new(),
             is_read: false,
+            jpeg: Jpeg::default(),
             intake: Intake::new(params, lens),
         })
     }
@@ -149,8 +156,10 @@ impl McapSource {
             return None;
         };
         let arrival = self.intake.arrive(stamp)?;
-        match picture_of(&waiting.payload, self.is_compressed) {
-            Ok(picture) => self.frame_with(arrival, picture),
+        let mut picture = self.intake.spare();
+        let jpeg = &mut self.jpeg;
+        match decode_into(&waiting.payload, self.is_compressed, jpeg, &mut picture) {
+            Ok(()) => self.frame_with(arrival, picture),
             Err(reason) => {
                 self.intake.undecodable(arrival.seq, &reason);
                 None
@@ -227,13 +236,26 @@ fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
     queue.iter().map(|waiting| waiting.payload.len()).sum()
 }
 
+/// For sources whose pictures come as messages, too.
+#[cfg(feature = "ros2")]
 pub(super) fn picture_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
+    let mut out = super::decode::empty();
+    decode_into(payload, is_compressed, &mut Jpeg::default(), &mut out)?;
+    Ok(out)
+}
+
+fn decode_into(
+    payload: &[u8],
+    is_compressed: bool,
+    jpeg: &mut Jpeg,
+    out: &mut RgbImage,
+) -> Result<(), String> {
     if is_compressed {
         let message: CompressedImage = ros::decode(payload).map_err(|e| e.to_string())?;
-        return super::decode::compressed(&message.data).map_err(|e| e.to_string());
+        return super::decode::compressed_into(&message.data, jpeg, out).map_err(|e| e.to_string());
     }
     let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
-    super::decode::raw(&message).map_err(|e| e.to_string())
+    super::decode::raw_into(&message, out).map_err(|e| e.to_string())
 }
 
 pub(super) fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {

@@ -1,19 +1,30 @@
-//! Frames from the world: recordings, image folders, made-up scenes.
+//! Frames from the world: cameras, recordings, image folders, made-up scenes.
 //!
 //! A source hands out decoded, undistorted frames in order of arrival and counts what it could not use.
 
+pub mod bag_writer;
 pub mod calibration;
+pub mod camera;
+pub mod camera_info;
 pub mod decode;
 pub mod images;
 pub mod intake;
+pub mod jpeg;
 pub mod mcap;
+pub mod pixels;
+pub mod recording;
 pub mod rectify;
 pub mod ros2;
 pub mod scene_formats;
 pub mod synthetic;
+#[cfg(all(feature = "camera-v4l", target_os = "linux"))]
+pub mod v4l2;
+#[cfg(feature = "camera-nokhwa")]
+pub mod webcam;
 
 mod bag;
 mod bag_file;
+mod pool;
 mod survey;
 mod topics;
 mod truth;
@@ -21,11 +32,15 @@ mod truth;
 use std::cmp::Ordering;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::config::SourceParams;
 use crate::frame::Frame;
 use crate::pose::Rigid;
+use crate::source::camera::CameraError;
+use crate::source::camera::live::Opener;
 
 /// What a source met so far; copied into `report.json`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -35,8 +50,10 @@ pub struct SourceCounts {
     pub undecodable: u64,
     /// Stamps that did not increase; such frames are left out.
     pub out_of_order: u64,
-    /// Came faster than they were looked at; they count as received, too.
+    /// Made and never looked at: the driver skipped their numbers, or they came faster than they were taken.
     pub dropped: u64,
+    /// Times that a camera stopped and was opened again.
+    pub interruptions: u64,
     /// The fault that ended the input early, for example a truncated recording. Frames before it stay in use.
     pub fault: Option<String>,
 }
@@ -51,7 +68,7 @@ pub enum SourceError {
         path: PathBuf,
     },
     #[error(
-        "{uri:?} is no source URI; expected mcap:PATH, images:DIR, synthetic:SCENE, ros2:/TOPIC or the path of a recording or folder"
+        "{uri:?} is no source URI; expected v4l2:/dev/video0, webcam:0, mcap:PATH, images:DIR, synthetic:SCENE, ros2:/TOPIC or the path of a recording or folder"
     )]
     Uri { uri: String },
     #[error("no topic of type sensor_msgs/msg/Image or CompressedImage; found {found}; name one with --set source.image_topic=/TOPIC: {}", path.display())]
@@ -64,6 +81,8 @@ pub enum SourceError {
     },
     #[error("{uri:?} is not in this build; {way_out}")]
     NotInBuild { uri: String, way_out: &'static str },
+    #[error(transparent)]
+    Camera(#[from] CameraError),
     #[cfg(feature = "ros2")]
     #[error("cannot subscribe to {topic:?}: {reason}")]
     Subscribe { topic: String, reason: String },
@@ -72,7 +91,7 @@ pub enum SourceError {
 /// What a look for the next frame found.
 #[derive(Debug)]
 pub enum Polled {
-    Frame(Frame),
+    Frame(Box<Frame>),
     /// None yet; more may come.
     Waiting,
     Ended,
@@ -85,7 +104,8 @@ pub trait Source: Send {
 
     /// The next frame, if one comes within `patience`. Sources that wait for the world override it.
     fn poll(&mut self, _patience: Duration) -> Polled {
-        self.next().map_or(Polled::Ended, Polled::Frame)
+        self.next()
+            .map_or(Polled::Ended, |frame| Polled::Frame(Box::new(frame)))
     }
 
     /// How the camera is mounted on the robot, `base_from_cam` in metres, where the input says so.
@@ -110,10 +130,58 @@ pub trait Source: Send {
 
     /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
     fn truth_extent(&self) -> Option<f64>;
+
+    /// Pictures come when the world makes them: those not taken in time are lost, so nothing may wait.
+    fn is_live(&self) -> bool {
+        false
+    }
+
+    /// A source that waits for the world ends `next` with `None` soon after the end is asked for.
+    fn end_when(&mut self, _asked: &Arc<AtomicBool>) {}
 }
 
-/// Opens `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
+/// Opens the camera of `v4l2:PATH` or `webcam:INDEX`; `None` for a URI that names no camera.
+pub fn camera_opener(uri: &str, params: &SourceParams) -> Option<Result<Opener, SourceError>> {
+    match uri.split_once(':')? {
+        ("v4l2", path) => Some(v4l2_opener(path, params)),
+        ("webcam", index) => Some(webcam_opener(index, params)),
+        _ => None,
+    }
+}
+
+#[cfg(all(feature = "camera-v4l", target_os = "linux"))]
+#[allow(clippy::unnecessary_wraps, reason = "builds without it refuse")]
+fn v4l2_opener(path: &str, params: &SourceParams) -> Result<Opener, SourceError> {
+    Ok(v4l2::opener(Path::new(path), params))
+}
+
+#[cfg(not(all(feature = "camera-v4l", target_os = "linux")))]
+fn v4l2_opener(path: &str, _params: &SourceParams) -> Result<Opener, SourceError> {
+    Err(SourceError::NotInBuild {
+        uri: format!("v4l2:{path}"),
+        way_out: "build with --features camera-v4l on Linux, or with camera-nokhwa elsewhere",
+    })
+}
+
+#[cfg(feature = "camera-nokhwa")]
+fn webcam_opener(index: &str, params: &SourceParams) -> Result<Opener, SourceError> {
+    webcam::opener(index, params)
+}
+
+#[cfg(not(feature = "camera-nokhwa"))]
+fn webcam_opener(index: &str, _params: &SourceParams) -> Result<Opener, SourceError> {
+    Err(SourceError::NotInBuild {
+        uri: format!("webcam:{index}"),
+        way_out: "build with --features camera-nokhwa, or on Linux use v4l2:/dev/video0",
+    })
+}
+
+/// Opens a camera, `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
 pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
+    if let Some(opener) = camera_opener(uri, params) {
+        let source = camera::CameraSource::open(uri.to_owned(), opener?, params)?;
+        return Ok(Box::new(source));
+    }
     let not_in_build = |way_out| {
         Err(SourceError::NotInBuild {
             uri: uri.to_owned(),
@@ -124,9 +192,6 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
         Some(("mcap", path)) => open_mcap(Path::new(path), params),
         Some(("images", path)) => open_images(Path::new(path), params, seed),
         Some(("synthetic", scene)) => open_synthetic(scene, params, seed),
-        Some(("v4l2" | "webcam", _)) => not_in_build(
-            "record the camera with ros2 bag record -s mcap and open that recording as mcap:PATH",
-        ),
         #[cfg(feature = "ros2")]
         Some(("ros2", topic)) => Ok(Box::new(ros2::subscriber::Ros2Source::open(topic, params)?)),
         #[cfg(not(feature = "ros2"))]
@@ -157,6 +222,9 @@ fn open_synthetic(
     params: &SourceParams,
     seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
+    if scene.split('?').next() == Some("endless") {
+        return Ok(Box::new(synthetic::endless::EndlessSource::open(scene)?));
+    }
     Ok(Box::new(synthetic::SyntheticSource::open(
         scene, params, seed,
     )?))

@@ -34,7 +34,7 @@ pub struct Splats {
     pub anchors: Vec<u32>,
 }
 
-/// A picture to train on. Index in the engine = order of `add_view`.
+/// A picture to train on, or a hollow one, which no step may have. Index in the engine = order of `add_view`.
 #[derive(Debug, Clone)]
 pub struct TrainingView {
     pub image: Arc<RgbImage>,
@@ -195,8 +195,11 @@ pub trait Engine: Send {
     /// Begins with a fresh network; what the old one did to the poses stays in them.
     fn start_refiner(&mut self, settings: &RefinerSettings);
 
-    /// Replaces a view's picture by one of the same size, and its intrinsics.
+    /// Replaces a view's picture, and its intrinsics. A mask of another size must have gone before.
     fn set_image(&mut self, view_ix: usize, image: Arc<RgbImage>, intrinsics: &Intrinsics);
+
+    /// Lets go of a view's picture, depth, mask and matches; where it stands stays. No step until it has a picture again.
+    fn rest_view(&mut self, _view_ix: usize) {}
 
     /// Replaces the depth that guides a view's depth loss.
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>);
@@ -233,6 +236,24 @@ pub trait Engine: Send {
     /// Most bytes that the buffers on a GPU have held; 0 on the CPU.
     fn peak_gpu_bytes(&self) -> u64;
 
+    /// Bytes that it holds: splats, optimiser state and views; on a GPU those of all buffers there.
+    fn held_bytes(&self) -> u64 {
+        0
+    }
+
+    /// Splats that there may be in all without `held_bytes` passing `max_bytes`, not even while rows are moved.
+    fn room_within(&self, _max_bytes: u64) -> usize {
+        usize::MAX
+    }
+
+    /// Waits for all steps and reads how many updates each splat has had: what admits the bands of its colour.
+    fn ages(&mut self) -> Vec<u16> {
+        vec![0; self.n_splats()]
+    }
+
+    /// Gives splats from `first` on the ages that they had in an earlier run.
+    fn set_ages(&mut self, _first: usize, _ages: &[u16]) {}
+
     /// Waits for all steps and reads the splats back.
     fn splats(&mut self) -> Splats;
 
@@ -260,10 +281,9 @@ impl TrainingView {
             "a view's intrinsics are those of its image"
         );
         let n_pixels = size.0 as usize * size.1 as usize;
-        assert_eq!(
-            image.pixels.len(),
-            3 * n_pixels,
-            "an image is as large as it says"
+        assert!(
+            image.is_hollow() || image.pixels.len() == 3 * n_pixels,
+            "an image is as large as it says, or its pixels are elsewhere"
         );
         let is_fit = self.mask.as_ref().is_none_or(|mask| mask.len() == n_pixels);
         assert!(is_fit, "a mask has one byte for each of {n_pixels} pixels");

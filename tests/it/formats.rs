@@ -91,9 +91,8 @@ pub(crate) fn random_snapshot(
 fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
     Checkpoint {
         landmarks: vec![7; 33],
-        snapshot: random_snapshot(n_splats, 5, sh_degree, 9),
-        seed: 11,
-        steps: 3000,
+        ages: (0..n_splats as u16).collect(),
+        ..Checkpoint::of(random_snapshot(n_splats, 5, sh_degree, 9), 11, 3000)
     }
 }
 
@@ -117,6 +116,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         );
         assert_eq!((back.seed, back.steps), (11, 3000));
         assert_eq!(back.landmarks, written.landmarks);
+        assert_eq!(back.ages, written.ages);
     }
 }
 
@@ -134,7 +134,7 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
         end += 16 + n;
     }
     assert_eq!(boundaries.pop(), Some(bytes.len()));
-    assert_eq!(boundaries.len(), 5 + 4 * 4 - 1);
+    assert_eq!(boundaries.len(), 5 + 4 * 7 - 1);
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {

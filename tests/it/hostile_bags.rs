@@ -220,7 +220,7 @@ fn odd_pictures_are_counted_and_the_rest_stays_in_use() {
             received: 12,
             undecodable: 9,
             out_of_order: 1,
-            fault: None
+            ..SourceCounts::default()
         }
     );
 }

@@ -111,6 +111,10 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("tracing_subscriber", &["src/node/run_dir.rs"][..]),
         ("serde_saphyr", &["src/config", "src/source/"][..]),
         ("yuv", &["src/source/"][..]),
+        ("v4l", &["src/source/v4l2/sys.rs"][..]),
+        ("libc", &["src/source/v4l2/"][..]),
+        ("nokhwa", &["src/source/webcam.rs"][..]),
+        ("zune_jpeg", &["src/source/jpeg.rs"][..]),
         ("fast_image_resize", &["src/frame.rs", "src/source/"][..]),
         (
             "kornia_imgproc",
@@ -119,9 +123,12 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("kornia_3d", &["src/geometry/"][..]),
         ("ort", &["src/onnx.rs"][..]),
         ("wgpu", &["src/gpu/"][..]),
+        (
+            "multiversion",
+            &["src/splat/cpu/", "src/geometry/", "src/source/"][..],
+        ),
         ("r2r", &["src/source/ros2/", "src/publish/ros2/"][..]),
         ("futures", &["src/source/ros2/"][..]),
-        ("multiversion", &["src/splat/cpu/", "src/geometry/"][..]),
     ])
 }
 

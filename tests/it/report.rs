@@ -5,19 +5,37 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 use splat_mapper::config::Settings;
 use splat_mapper::eval::report::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
+    Continued, FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
 };
+use splat_mapper::map::figures::Budgets;
 use splat_mapper::map::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.
 const KEYS: &str = "\
 adapter
+budgets.evicted_splats
+budgets.growth_refused
+budgets.keyframes_on_disk
+budgets.max_gpu_mib
+budgets.max_keyframes_in_ram
+budgets.max_splats
+budgets.peak_engine_mib
+budgets.peak_keyframes_in_ram
+budgets.peak_splats
+budgets.pictures_lost
+budgets.restored_splats
+budgets.splats_on_disk
+continued.asked
+continued.found
+continued.joined
+continued.map_keyframes
 error
 frames.dropped
 frames.out_of_order
 frames.received
 frames.undecodable
 geometry_note
+keyframes.before
 keyframes.components
 keyframes.registered
 keyframes.selected
@@ -74,6 +92,7 @@ pub(crate) fn sample_report() -> Report {
         keyframes: KeyframeCounts {
             selected: 38,
             registered: 37,
+            before: 40,
             components: 1,
         },
         splats: 58_312,
@@ -104,6 +123,17 @@ pub(crate) fn sample_report() -> Report {
             ssim_holdout: Some(0.791),
             lpips_holdout: None,
         },
+        budgets: Budgets {
+            max_splats: 60_000,
+            evicted_splats: 12,
+            ..Budgets::default()
+        },
+        continued: Some(Continued {
+            map_keyframes: 40,
+            asked: 12,
+            found: 9,
+            joined: true,
+        }),
         scale: snapshot::Scale::UP_TO_SCALE.into(),
         source_fault: None,
         geometry_note: Some(

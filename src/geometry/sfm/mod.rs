@@ -49,6 +49,8 @@ const ERROR_SIDE_PX: f64 = 640.0;
 const MIN_NEW_COMPONENT: usize = 4;
 /// Waiting keyframes that are tried with every batch, the newest; all others once more at the end.
 const MAX_WAITING: usize = 64;
+/// Keyframes whose pictures are held, more than stereo reaches back; and twice as many that have no place.
+const MAX_PICTURES: usize = 128;
 /// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
 const FIRST_FOCAL: f64 = 0.9;
 
@@ -160,7 +162,20 @@ impl Sfm {
             self.push(keyframe, features, size);
             link_newest(&mut self.scene, limits.max_error_px, self.seed);
         }
+        self.let_go();
         limits
+    }
+
+    /// Pictures that stereo has no use for any more leave memory; features and sizes stay.
+    fn let_go(&mut self) {
+        let n = self.scene.shots.len();
+        for (ix, shot) in self.scene.shots.iter_mut().enumerate() {
+            let is_old = shot.placed.is_some() && ix + MAX_PICTURES < n;
+            let is_hopeless = ix + 2 * MAX_PICTURES < n;
+            if (is_old || is_hopeless) && !shot.keyframe.frame.image.is_hollow() {
+                shot.keyframe = Arc::new(shot.keyframe.hollow());
+            }
+        }
     }
 
     /// Shots of the keyframes that the batch before had, too.

@@ -162,7 +162,8 @@ impl Scene {
             .iter()
             .rev()
             .find(|s| s.keyframe.id == keyframe_id)?;
-        Some(Arc::clone(&shot.keyframe.frame.image))
+        let image = &shot.keyframe.frame.image;
+        (!image.is_hollow()).then(|| Arc::clone(image))
     }
 
     pub(super) fn component_of(&self, shot_ix: usize) -> Option<u32> {

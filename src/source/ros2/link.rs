@@ -1,15 +1,12 @@
-//! This process as a ROS 2 node: one thread owns it, makes what others ask for and hands on what comes in.
-//!
-//! Knows nothing of pictures and maps. r2r keeps ten messages of a subscription and then drops the newest; the thread
-//! empties all of them after each message, so that what is lost is lost in queues of ours, which count.
+//! This process as a ROS 2 node, as the rest of the program holds it: orders to the thread that owns it (`spin`), its names,
+//! its parameters, its time. Knows nothing of pictures and maps.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use futures::{FutureExt, Stream, StreamExt};
 use r2r::QosProfile;
 use r2r::qos::{DurabilityPolicy, ReliabilityPolicy};
 use serde_json::Value;
@@ -18,15 +15,11 @@ use crate::clock::{Stamp, Stopwatch};
 use crate::config::live::Live;
 use crate::config::{ConfigError, Settings};
 use crate::source::ros2::names::{Names, ros_arguments};
+use crate::source::ros2::spin::{Order, SPIN, Spun, spin};
 use crate::source::survey::header_stamp;
 
 /// The mapper's name where no argument gives another.
 pub const NODE_NAME: &str = "splat_mapper";
-/// Longest sleep of the thread; orders wait no longer.
-const SPIN: Duration = Duration::from_millis(5);
-/// Shortest turn of the thread.
-const MIN_SPIN: Duration = Duration::from_micros(100);
-const NEVER: Duration = Duration::from_secs(1 << 30);
 /// Orders on their way to the thread.
 const MAX_ORDERS: usize = 64;
 /// An order that took longer found the thread stuck in the middleware.
@@ -44,43 +37,8 @@ pub enum LinkError {
     Refused { what: String, reason: String },
     #[error("ROS 2 did not answer within {} s while asked for {what}", MAX_ORDER.as_secs())]
     Stuck { what: String },
-    #[error("parameter given by ROS 2: {0}")]
+    #[error(transparent)]
     Parameter(#[from] ConfigError),
-}
-
-type Order = Box<dyn FnOnce(&mut Spun) + Send>;
-
-/// What the thread owns.
-pub struct Spun {
-    pub node: r2r::Node,
-    /// Each empties one stream; false once nobody wants more of it.
-    inlets: Vec<Box<dyn FnMut() -> bool>>,
-    /// Never rings: without anything to wait for, rcl complains and r2r spins (its issue 93).
-    _timer: r2r::Timer,
-}
-
-impl std::fmt::Debug for Spun {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Spun({} streams)", self.inlets.len())
-    }
-}
-
-impl Spun {
-    /// Hands each item of a stream to `sink`, on this thread, until `sink` says false.
-    pub fn drain<T: 'static>(
-        &mut self,
-        mut stream: impl Stream<Item = T> + Unpin + 'static,
-        mut sink: impl FnMut(T) -> bool + 'static,
-    ) {
-        self.inlets.push(Box::new(move || {
-            while let Some(Some(item)) = stream.next().now_or_never() {
-                if !sink(item) {
-                    return false;
-                }
-            }
-            true
-        }));
-    }
 }
 
 /// A publisher of a topic, as the graph shows it.
@@ -122,21 +80,25 @@ impl Link {
         let (orders, ordered) = sync_channel(MAX_ORDERS);
         let (started_tx, started) = sync_channel(1);
         let is_ending = Arc::new(AtomicBool::new(false));
-        let end = Arc::clone(&is_ending);
+        let asked = Arc::clone(&is_ending);
         let thread = std::thread::Builder::new()
             .name("ros2".to_owned())
-            .spawn(move || spin(name, &ordered, &started_tx, &end))
+            .spawn(move || spin(name, &ordered, &started_tx, &asked))
             .map_err(|e| start_error(&e))?;
         let started = started.recv_timeout(MAX_ORDER);
-        let (namespace, node, overrides) = started.map_err(|e| start_error(&e))??;
-        for (key, value) in overrides {
-            // rclcpp knows these of its own accord; here QoS is chosen by parameters of the node.
-            if key.starts_with("qos_overrides.") {
-                tracing::warn!("parameter {key} does nothing here");
-            } else {
-                settings.set(&key, value)?;
+        let started = started.unwrap_or_else(|e| Err(start_error(&e)));
+        let applied = started.and_then(|(namespace, node, overrides)| {
+            apply(settings, overrides)?;
+            Ok((namespace, node))
+        });
+        let (namespace, node) = match applied {
+            Ok(names) => names,
+            Err(error) => {
+                // The middleware must not be in use while the process ends.
+                end(thread, &is_ending);
+                return Err(error);
             }
-        }
+        };
         let has_sim_time = settings.value("use_sim_time") == Some(&Value::Bool(true));
         let link = Arc::new(Self {
             orders,
@@ -276,23 +238,9 @@ impl Link {
 
     /// Ends the thread, and with it all subscriptions, publishers and services. Later orders are refused.
     pub fn close(&self) {
-        self.is_ending.store(true, Ordering::Relaxed);
         let thread = lock(&self.thread).take();
-        let Some(thread) = thread else {
-            return;
-        };
-        let watch = Stopwatch::start();
-        while !thread.is_finished() && watch.elapsed() < MAX_CLOSING {
-            std::thread::sleep(SPIN);
-        }
-        if thread.is_finished() {
-            if thread.join().is_err() {
-                tracing::warn!("the thread of the ROS 2 node panicked");
-            }
-        } else {
-            tracing::warn!(
-                "the ROS 2 node did not end within {MAX_CLOSING:?}; its thread is left behind"
-            );
+        if let Some(thread) = thread {
+            end(thread, &self.is_ending);
         }
     }
 }
@@ -303,89 +251,40 @@ impl Drop for Link {
     }
 }
 
+fn end(thread: JoinHandle<()>, is_ending: &AtomicBool) {
+    is_ending.store(true, Ordering::Relaxed);
+    let watch = Stopwatch::start();
+    while !thread.is_finished() && watch.elapsed() < MAX_CLOSING {
+        std::thread::sleep(SPIN);
+    }
+    if !thread.is_finished() {
+        tracing::warn!(
+            "the ROS 2 node did not end within {MAX_CLOSING:?}; its thread is left behind"
+        );
+    } else if thread.join().is_err() {
+        tracing::warn!("the thread of the ROS 2 node panicked");
+    }
+}
+
+fn apply(settings: &mut Settings, overrides: Vec<(String, Value)>) -> Result<(), ConfigError> {
+    for (key, value) in overrides {
+        // rclcpp knows these of its own accord; here QoS is chosen by parameters of the node.
+        if key.starts_with("qos_overrides.") {
+            tracing::warn!("parameter {key} does nothing here");
+        } else {
+            settings.set(&key, value)?;
+        }
+    }
+    Ok(())
+}
+
 /// What these mutexes hold is exchanged whole: a panic leaves nothing half made.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Namespace, name, and parameters by key.
-type Started = (String, String, Vec<(String, Value)>);
-
-fn spin(
-    name: &str,
-    orders: &Receiver<Order>,
-    started: &SyncSender<Result<Started, LinkError>>,
-    is_ending: &AtomicBool,
-) {
-    let mut spun = match start(name) {
-        Ok((spun, names)) => {
-            started.try_send(Ok(names)).ok();
-            spun
-        }
-        Err(error) => {
-            started.try_send(Err(error)).ok();
-            return;
-        }
-    };
-    while !is_ending.load(Ordering::Relaxed) {
-        loop {
-            match orders.try_recv() {
-                Ok(order) => order(&mut spun),
-                Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => return,
-            }
-        }
-        let watch = Stopwatch::start();
-        spun.node.spin_once(SPIN);
-        spun.inlets.retain_mut(|inlet| inlet());
-        // After an error spin_once returns at once.
-        if watch.elapsed() < MIN_SPIN {
-            std::thread::sleep(MIN_SPIN);
-        }
-    }
-}
-
-fn start(name: &str) -> Result<(Spun, Started), LinkError> {
-    // r2r panics where rcl refuses an argument.
-    let context = std::panic::catch_unwind(r2r::Context::create);
-    let context = context.map_err(|panic| LinkError::Start {
-        reason: panic.downcast_ref::<String>().cloned().unwrap_or_default(),
-    })?;
-    let context = context.map_err(|e| start_error(&e))?;
-    let mut node = r2r::Node::create(context, name, "").map_err(|e| start_error(&e))?;
-    let timer = node.create_wall_timer(NEVER).map_err(|e| start_error(&e))?;
-    let namespace = node.namespace().map_err(|e| start_error(&e))?;
-    let name = node.name().map_err(|e| start_error(&e))?;
-    let overrides = {
-        let given = node.params.lock().unwrap_or_else(PoisonError::into_inner);
-        let pairs = given
-            .iter()
-            .map(|(key, parameter)| (key.clone(), json_of(&parameter.value)));
-        pairs.collect()
-    };
-    let spun = Spun {
-        node,
-        inlets: Vec::new(),
-        _timer: timer,
-    };
-    Ok((spun, (namespace, name, overrides)))
-}
-
-fn start_error(reason: &dyn std::fmt::Display) -> LinkError {
+pub(super) fn start_error(reason: &dyn std::fmt::Display) -> LinkError {
     LinkError::Start {
         reason: reason.to_string(),
-    }
-}
-
-fn json_of(value: &r2r::ParameterValue) -> Value {
-    use r2r::ParameterValue as P;
-    match value {
-        P::NotSet => Value::Null,
-        P::Bool(v) => (*v).into(),
-        P::Integer(v) => (*v).into(),
-        P::Double(v) => (*v).into(),
-        P::String(v) => v.clone().into(),
-        // No parameter of ours is a list; the settings say so.
-        other => format!("{other:?}").into(),
     }
 }

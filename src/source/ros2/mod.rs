@@ -10,6 +10,8 @@ pub mod names;
 #[cfg(feature = "ros2")]
 mod pictures;
 #[cfg(feature = "ros2")]
+pub mod spin;
+#[cfg(feature = "ros2")]
 pub mod subscriber;
 #[cfg(feature = "ros2")]
 pub mod watch;

@@ -307,7 +307,7 @@ impl Source for Ros2Source {
     fn next(&mut self) -> Option<Frame> {
         loop {
             match self.poll(Duration::from_secs(1)) {
-                Polled::Frame(frame) => return Some(frame),
+                Polled::Frame(frame) => return Some(*frame),
                 Polled::Waiting => {}
                 Polled::Ended => return None,
             }
@@ -341,7 +341,7 @@ impl Source for Ros2Source {
                 if self.watch.is_due() {
                     self.look_for_silence();
                 }
-                return Polled::Frame(frame);
+                return Polled::Frame(Box::new(frame));
             }
         }
     }

@@ -5,6 +5,7 @@
 
 mod clutter;
 mod corridor;
+pub mod endless;
 mod facade;
 mod furniture;
 mod geometry;

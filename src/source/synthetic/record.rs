@@ -3,7 +3,6 @@
 //! The file appears under its name only when it is whole. Depth has the pixels of the picture as filmed, distortion
 //! included, at a fifth of its size, as the drivers of depth cameras register it.
 
-use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 use std::io::{Seek, Write};
@@ -11,18 +10,16 @@ use std::path::Path;
 
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
-use mcap::records::MessageHeader;
-use serde::Serialize;
 
 use crate::atomic::write_file;
-use crate::camera::{Distortion, Lens};
+use crate::camera::Lens;
 use crate::frame::DepthMap;
 use crate::pose::Rigid;
 use crate::ros::odometry::Odometry;
 use crate::ros::{
-    self, CameraInfo, CompressedImage, Header, Image, Message, Pose, PoseStamped, TfMessage,
-    TransformStamped,
+    CameraInfo, CompressedImage, Header, Image, Pose, PoseStamped, TfMessage, TransformStamped,
 };
+use crate::source::bag_writer::{BagWriter, Topic, camera_info, options};
 
 use super::odometry;
 use super::take::Take;
@@ -103,73 +100,13 @@ fn tum_lines(take: &Take) -> String {
     lines
 }
 
-/// One topic of the file under way.
-#[derive(Debug, Clone, Copy)]
-struct Topic {
-    channel_id: u16,
-    sequence: u32,
-}
-
-struct Recorder<W: Write + Seek> {
-    file: mcap::Writer<W>,
-    n_messages: u64,
-}
-
-impl<W: Write + Seek> Recorder<W> {
-    fn topic<T: Message>(&mut self, name: &str) -> Result<Topic, String> {
-        let schema = self
-            .file
-            .add_schema(T::TYPE_NAME, "ros2msg", T::DEFINITION.as_bytes());
-        let schema = schema.map_err(|e| e.to_string())?;
-        let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), String::new())]);
-        let channel_id = self
-            .file
-            .add_channel(schema, name, "cdr", &metadata)
-            .map_err(|e| e.to_string())?;
-        Ok(Topic {
-            channel_id,
-            sequence: 0,
-        })
-    }
-
-    fn write<T: Message + Serialize>(
-        &mut self,
-        topic: &mut Topic,
-        nanos: u64,
-        message: &T,
-    ) -> Result<(), String> {
-        let payload = ros::encode(message).map_err(|e| e.to_string())?;
-        let header = MessageHeader {
-            channel_id: topic.channel_id,
-            sequence: topic.sequence,
-            log_time: nanos,
-            publish_time: nanos,
-        };
-        topic.sequence += 1;
-        self.n_messages += 1;
-        self.file
-            .write_to_known_channel(&header, &payload)
-            .map_err(|e| e.to_string())
-    }
-}
-
 fn record(
     take: &Take,
     file: impl Write + Seek,
     on_frame: &mut impl FnMut(u32),
 ) -> Result<u64, String> {
-    let options = mcap::WriteOptions::new()
-        .profile("ros2")
-        .library(concat!("splat-mapper ", env!("CARGO_PKG_VERSION")))
-        .compression(Some(mcap::Compression::Zstd))
-        // Only depth can be squeezed here, JPEG cannot: a high level costs little time.
-        .compression_level(12)
-        // One thread: the bytes must not depend on the machine.
-        .compression_threads(0);
-    let mut out = Recorder {
-        file: options.create(file).map_err(|e| e.to_string())?,
-        n_messages: 0,
-    };
+    // Only depth can be squeezed here, JPEG cannot: a high level costs little time.
+    let mut out = BagWriter::new(options(12), file)?;
     let mut pictures = out.topic::<CompressedImage>("/camera/image_raw/compressed")?;
     let mut calibration = out.topic::<CameraInfo>("/camera/camera_info")?;
     let mut tf = out.topic::<TfMessage>("/tf")?;
@@ -221,8 +158,9 @@ fn record(
         out.write(&mut pictures, nanos, &picture)?;
         on_frame(ix + 1);
     }
-    out.file.finish().map_err(|e| e.to_string())?;
-    Ok(out.n_messages)
+    let n_messages = out.n_messages;
+    out.finish()?;
+    Ok(n_messages)
 }
 
 /// Odometry on its way into a file.
@@ -233,7 +171,7 @@ struct Wheels {
 }
 
 impl Wheels {
-    fn new<W: Write + Seek>(take: &Take, out: &mut Recorder<W>) -> Result<Option<Self>, String> {
+    fn new<W: Write + Seek>(take: &Take, out: &mut BagWriter<W>) -> Result<Option<Self>, String> {
         let Some(noise) = take.settings().odometry else {
             return Ok(None);
         };
@@ -246,7 +184,7 @@ impl Wheels {
 
     fn write<W: Write + Seek>(
         &mut self,
-        out: &mut Recorder<W>,
+        out: &mut BagWriter<W>,
         ix: u32,
         nanos: u64,
         header: Header,
@@ -326,28 +264,5 @@ fn depth_image(map: &DepthMap, header: Header) -> Image {
             .iter()
             .flat_map(|depth| millimetres(depth).to_le_bytes())
             .collect(),
-    }
-}
-
-/// ROS counts pixel centres at integers, half a pixel less than we do.
-fn camera_info(lens: &Lens, header: Header) -> CameraInfo {
-    let i = lens.intrinsics;
-    let (cx, cy) = (i.cx - 0.5, i.cy - 0.5);
-    let (distortion_model, d) = match lens.distortion {
-        Distortion::None => ("plumb_bob", vec![0.0; 5]),
-        Distortion::PlumbBob(d) => ("plumb_bob", d.to_vec()),
-        Distortion::Rational(d) => ("rational_polynomial", d.to_vec()),
-        Distortion::Equidistant(d) => ("equidistant", d.to_vec()),
-    };
-    CameraInfo {
-        header,
-        height: i.height_px,
-        width: i.width_px,
-        distortion_model: distortion_model.to_owned(),
-        d,
-        k: [i.fx, 0.0, cx, 0.0, i.fy, cy, 0.0, 0.0, 1.0],
-        r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p: [i.fx, 0.0, cx, 0.0, 0.0, i.fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ..CameraInfo::default()
     }
 }

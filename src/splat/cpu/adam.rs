@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::adam_sh::{BAND_0, ShMoments};
 use super::project::{CHUNK, Projected};
 use super::project_backward::SplatGradients;
-use super::rows::retain_rows;
+use super::rows::{make_room, retain_rows};
 use crate::splat::{Splats, StepSettings};
 
 pub(crate) const BETA_1: f32 = 0.9;
@@ -78,9 +78,14 @@ impl Optimiser {
     /// Splats behind those that were there start at rest, seen by step `now`.
     pub(crate) fn resize(&mut self, splats: &Splats, now: u32) {
         let n = splats.len();
+        let more = n.saturating_sub(self.ages.len());
+        make_room(&mut self.ages, more);
+        make_room(&mut self.last_seen, more);
         self.ages.resize(n, Ages::default());
         self.last_seen.resize(n, now);
         for (moments, stride) in self.moments_mut() {
+            make_room(&mut moments.first, more * stride);
+            make_room(&mut moments.second, more * stride);
             moments.first.resize(n * stride, 0.0);
             moments.second.resize(n * stride, 0.0);
         }
@@ -111,6 +116,42 @@ impl Optimiser {
     pub(crate) fn copy_age(&mut self, from: usize, to: usize) {
         self.ages[to] = self.ages[from];
         self.last_seen[to] = self.last_seen[from];
+    }
+
+    /// Updates that each splat has had in all.
+    pub(crate) fn ages(&self) -> Vec<u16> {
+        self.ages.iter().map(|ages| ages.in_all).collect()
+    }
+
+    /// Of splats from `first` on, whose moments are 0.
+    pub(crate) fn set_ages(&mut self, first: usize, ages: &[u16]) {
+        for (own, in_all) in self.ages[first..].iter_mut().zip(ages) {
+            own.in_all = *in_all;
+        }
+    }
+
+    /// Parameters included.
+    pub(crate) fn bytes_per_splat(sh_degree: u8) -> usize {
+        let n_sh = 3 * (usize::from(sh_degree) + 1).pow(2);
+        let of_moments = 2 * (3 + 3 + 4 + 1 + BAND_0);
+        let words = 3 + 3 + 4 + 1 + n_sh + 1 + of_moments + size_of::<Ages>() / 4 + 1;
+        4 * words + ShMoments::bytes_per_splat(sh_degree)
+    }
+
+    /// Room for more rows included.
+    pub(crate) fn held_bytes(&self) -> usize {
+        let all = [
+            &self.means,
+            &self.log_scales,
+            &self.quats,
+            &self.opacity_logits,
+            &self.sh_band_0,
+        ];
+        let of_moments = |m: &&Moments| 4 * (m.first.capacity() + m.second.capacity());
+        all.iter().map(of_moments).sum::<usize>()
+            + self.sh_above.held_bytes()
+            + size_of::<Ages>() * self.ages.capacity()
+            + 4 * self.last_seen.capacity()
     }
 
     /// Steps since the splat was seen; 0: by step `now` itself.

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::adam::{Ages, BETA_1, BETA_2, EPS, correction};
 use super::project::{CHUNK, Projected};
 use super::project_backward::SplatGradients;
-use super::rows::retain_rows;
+use super::rows::{make_room, retain_rows};
 use crate::splat::{Splats, StepSettings};
 
 /// Numbers of band 0, which is trained like any other attribute.
@@ -26,8 +26,23 @@ pub(crate) struct ShMoments {
 
 impl ShMoments {
     pub(crate) fn resize(&mut self, n: usize, sh_stride: usize) {
-        self.first.resize(n * (sh_stride - BAND_0), 0);
-        self.second.resize(n * n_bands(sh_stride), 0.0);
+        let (n_first, n_second) = (n * (sh_stride - BAND_0), n * n_bands(sh_stride));
+        let more = n_first.saturating_sub(self.first.len());
+        make_room(&mut self.first, more);
+        let more = n_second.saturating_sub(self.second.len());
+        make_room(&mut self.second, more);
+        self.first.resize(n_first, 0);
+        self.second.resize(n_second, 0.0);
+    }
+
+    pub(crate) fn bytes_per_splat(sh_degree: u8) -> usize {
+        let sh_stride = 3 * (usize::from(sh_degree) + 1).pow(2);
+        2 * (sh_stride - BAND_0) + 4 * n_bands(sh_stride)
+    }
+
+    /// Room for more rows included.
+    pub(crate) fn held_bytes(&self) -> usize {
+        2 * self.first.capacity() + 4 * self.second.capacity()
     }
 
     pub(crate) fn retain(&mut self, sh_stride: usize, keep: &[bool]) {

@@ -44,6 +44,9 @@ use crate::splat::{
     StepStats, TrainingView,
 };
 
+/// Rows grow by a quarter at a time, and the largest attribute is there twice while it grows.
+const MAX_SPARE: f64 = 1.75;
+
 /// Renders and optimises with rayon's global threads.
 #[derive(Debug, Default)]
 pub struct CpuEngine {
@@ -245,6 +248,10 @@ impl Engine for CpuEngine {
         self.set_intrinsics(view_ix, intrinsics);
     }
 
+    fn rest_view(&mut self, view_ix: usize) {
+        self.views[view_ix].rest();
+    }
+
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
         self.views[view_ix].training_mut().depth = depth;
     }
@@ -281,6 +288,27 @@ impl Engine for CpuEngine {
 
     fn peak_gpu_bytes(&self) -> u64 {
         0
+    }
+
+    fn held_bytes(&self) -> u64 {
+        let of_splats = self.splats.held_bytes() + self.optimiser.held_bytes();
+        let of_views: usize = self.views.iter().map(View::held_bytes).sum();
+        (of_splats + of_views) as u64
+    }
+
+    fn room_within(&self, max_bytes: u64) -> usize {
+        let of_views: usize = self.views.iter().map(View::held_bytes).sum();
+        let free = (max_bytes as usize).saturating_sub(of_views);
+        (free as f64 / (MAX_SPARE * Optimiser::bytes_per_splat(self.splats.sh_degree) as f64))
+            as usize
+    }
+
+    fn ages(&mut self) -> Vec<u16> {
+        self.optimiser.ages()
+    }
+
+    fn set_ages(&mut self, first: usize, ages: &[u16]) {
+        self.optimiser.set_ages(first, ages);
     }
 
     fn step(&mut self, view_ix: usize, settings: &StepSettings) {

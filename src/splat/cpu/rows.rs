@@ -13,12 +13,22 @@ impl Splats {
             self.sh_degree, more.sh_degree,
             "all splats of an engine have one SH degree"
         );
-        self.means.extend_from_slice(&more.means);
-        self.log_scales.extend_from_slice(&more.log_scales);
-        self.quats.extend_from_slice(&more.quats);
-        self.opacity_logits.extend_from_slice(&more.opacity_logits);
-        self.sh.extend_from_slice(&more.sh);
-        self.anchors.extend_from_slice(&more.anchors);
+        extend(&mut self.means, &more.means);
+        extend(&mut self.log_scales, &more.log_scales);
+        extend(&mut self.quats, &more.quats);
+        extend(&mut self.opacity_logits, &more.opacity_logits);
+        extend(&mut self.sh, &more.sh);
+        extend(&mut self.anchors, &more.anchors);
+    }
+
+    /// Room for more rows included.
+    pub(crate) fn held_bytes(&self) -> usize {
+        let floats = 3 * self.means.capacity()
+            + 3 * self.log_scales.capacity()
+            + 4 * self.quats.capacity()
+            + self.opacity_logits.capacity()
+            + self.sh.capacity();
+        4 * (floats + self.anchors.capacity())
     }
 
     /// Keeps row i when `keep[i]`, in order.
@@ -66,6 +76,18 @@ impl Splats {
     }
 }
 
+fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
+    make_room(values, more.len());
+    values.extend_from_slice(more);
+}
+
+/// Room for `more` values, and for a quarter of all beyond: doubling would take twice the memory that a budget allows.
+pub(crate) fn make_room<T>(values: &mut Vec<T>, more: usize) {
+    if values.capacity() - values.len() < more {
+        values.reserve_exact(more.max(values.len() / 4));
+    }
+}
+
 /// Keeps row i of `stride` values when `keep[i]`.
 pub(crate) fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[bool]) {
     let mut end = 0;
@@ -79,6 +101,7 @@ pub(crate) fn retain_rows<T: Copy>(values: &mut Vec<T>, stride: usize, keep: &[b
 fn copy_row<T: Copy>(values: &mut Vec<T>, stride: usize, from: usize, to: usize) {
     let row = from * stride..(from + 1) * stride;
     if to * stride == values.len() {
+        make_room(values, stride);
         values.extend_from_within(row);
     } else {
         values.copy_within(row, to * stride);

@@ -4,6 +4,7 @@
 
 use std::sync::Arc;
 
+use crate::frame::RgbImage;
 use crate::pose::Rigid;
 use crate::splat::cpu::exposure::{Exposure, ExposureAdam};
 use crate::splat::cpu::pose_adam::PoseAdam;
@@ -104,6 +105,22 @@ impl View {
         let exposure = self.exposure_adam.update(self.exposure, gradient, rate);
         self.exposure = exposure.unwrap_or(self.exposure);
         exposure.is_some()
+    }
+
+    /// Only where the view stands stays.
+    pub(super) fn rest(&mut self) {
+        let image = &self.training.image;
+        self.training.image = Arc::new(RgbImage::hollow(image.width_px, image.height_px));
+        (self.training.depth, self.training.mask) = (None, None);
+        self.matches = Vec::new();
+    }
+
+    /// Of the picture and what guides the loss.
+    pub(super) fn held_bytes(&self) -> usize {
+        let view = &self.training;
+        let of_depth = view.depth.as_ref().map_or(0, |depth| 8 * depth.depth.len());
+        let of_mask = view.mask.as_ref().map_or(0, |mask| mask.len());
+        view.image.pixels.len() + of_depth + of_mask + size_of_val(&self.matches[..])
     }
 
     pub(super) fn set_mask(&mut self, mask: Option<Arc<[u8]>>) {

@@ -14,6 +14,9 @@ const GEOMETRY: usize = 16;
 const MOMENTS: usize = 32;
 const MIN_ROWS: usize = 1024;
 
+/// Where a row of `moments` has the updates in all.
+const AGE: usize = 19;
+
 /// Buffers with room for `capacity` rows, of which `n` are splats.
 #[derive(Debug)]
 pub(super) struct SplatMemory {
@@ -38,8 +41,7 @@ fn n_sh_moments(degree: u8) -> usize {
 }
 
 /// Bytes of a splat in all buffers.
-#[cfg(test)]
-fn bytes_per_splat(degree: u8) -> usize {
+pub(super) fn bytes_per_splat(degree: u8) -> usize {
     4 * (GEOMETRY + MOMENTS + n_sh_rest(degree) + n_sh_moments(degree) + 1)
 }
 
@@ -148,6 +150,25 @@ impl SplatMemory {
         let mut splats = self.unpack(&geometry, &rest);
         splats.anchors = gpu.read(&self.anchors, 0..self.n)?;
         Ok(splats)
+    }
+
+    pub(super) fn ages(&self, gpu: &Gpu) -> Result<Vec<u16>, GpuError> {
+        let rows: Vec<f32> = gpu.read(&self.moments, 0..self.n * MOMENTS)?;
+        let rows = rows.chunks_exact(MOMENTS);
+        Ok(rows.map(|row| row[AGE] as u16).collect())
+    }
+
+    /// Of splats from `first` on, whose moments are 0.
+    pub(super) fn set_ages(&self, gpu: &Gpu, first: usize, ages: &[u16]) {
+        let mut rows = vec![0.0_f32; MOMENTS * ages.len()];
+        for (row, age) in rows.chunks_exact_mut(MOMENTS).zip(ages) {
+            row[AGE] = f32::from(*age);
+        }
+        gpu.write(&self.moments, first * MOMENTS, &rows);
+    }
+
+    pub(super) fn n_bytes(&self) -> u64 {
+        self.buffers().iter().map(|buffer| buffer.n_bytes()).sum()
     }
 
     /// Rows as the shaders lay them out -> splats, anchors 0.

@@ -8,6 +8,7 @@ mod gradients;
 mod memory;
 mod moves;
 mod passes;
+mod room;
 mod steps;
 mod views;
 
@@ -87,49 +88,6 @@ impl WgpuEngine {
                 }
             })
             .ok()
-    }
-
-    fn try_append(&mut self, splats: &Splats) -> Result<(), GpuError> {
-        splats.assert_consistent();
-        self.confirm()?;
-        if self.memory.n == 0 && self.memory.sh_degree != splats.sh_degree {
-            self.memory = SplatMemory::new(&self.gpu, splats.sh_degree)?;
-            self.gpu.forget_bindings();
-        }
-        assert_eq!(
-            self.memory.sh_degree, splats.sh_degree,
-            "all splats of an engine have one SH degree"
-        );
-        let limit = memory::max_splats(&self.gpu, splats.sh_degree);
-        let room = limit.saturating_sub(self.memory.n);
-        if splats.len() > room {
-            if !self.has_warned_of_room {
-                tracing::warn!(
-                    "adapter {} has room for {limit} splats of SH degree {}: more are left out; said once",
-                    self.gpu.name(),
-                    splats.sh_degree
-                );
-                self.has_warned_of_room = true;
-            }
-            let mut fitting = splats.clone();
-            fitting.truncate(room);
-            return self.append_fitting(&fitting);
-        }
-        self.append_fitting(splats)
-    }
-
-    fn append_fitting(&mut self, splats: &Splats) -> Result<(), GpuError> {
-        if splats.is_empty() {
-            return Ok(());
-        }
-        if self
-            .memory
-            .reserve(&self.gpu, self.memory.n + splats.len())?
-        {
-            self.gpu.forget_bindings();
-        }
-        self.memory.append(&self.gpu, splats, self.n_trained);
-        Ok(())
     }
 
     fn try_render(
@@ -263,6 +221,13 @@ impl Engine for WgpuEngine {
         self.set_intrinsics(view_ix, intrinsics);
     }
 
+    fn rest_view(&mut self, view_ix: usize) {
+        let result = self
+            .confirm()
+            .and_then(|()| self.views.all[view_ix].rest(&self.gpu));
+        self.note(result);
+    }
+
     fn set_depth(&mut self, view_ix: usize, depth: Option<Arc<DepthMap>>) {
         let result = self.confirm().and_then(|()| {
             let view = &mut self.views.all[view_ix];
@@ -347,6 +312,26 @@ impl Engine for WgpuEngine {
 
     fn peak_gpu_bytes(&self) -> u64 {
         self.gpu.meter().peak_bytes()
+    }
+
+    fn held_bytes(&self) -> u64 {
+        self.gpu.meter().held_bytes()
+    }
+
+    fn room_within(&self, max_bytes: u64) -> usize {
+        room::splats_within(self, max_bytes)
+    }
+
+    fn ages(&mut self) -> Vec<u16> {
+        let result = self.confirm().and_then(|()| self.memory.ages(&self.gpu));
+        self.note(result).unwrap_or_default()
+    }
+
+    fn set_ages(&mut self, first: usize, ages: &[u16]) {
+        let n = self.memory.n.saturating_sub(first).min(ages.len());
+        let result = self.confirm();
+        self.memory.set_ages(&self.gpu, first, &ages[..n]);
+        self.note(result);
     }
 
     fn splats(&mut self) -> Splats {

@@ -1,9 +1,11 @@
 //! The views on the GPU: a record of pose, camera and exposure each, the picture that is wanted, and the shared network.
 
+use std::sync::Arc;
+
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::camera::Intrinsics;
-use crate::frame::DepthMap;
+use crate::frame::{DepthMap, RgbImage};
 use crate::gpu::GpuError;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::commands::Commands;
@@ -231,6 +233,18 @@ impl View {
         Ok(())
     }
 
+    /// Only where the view stands stays.
+    pub(super) fn rest(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        let image = &self.training.image;
+        let hollow = RgbImage::hollow(image.width_px, image.height_px);
+        self.training.image = Arc::new(hollow);
+        (self.training.depth, self.training.mask) = (None, None);
+        self.matches = Vec::new();
+        self.wanted = gpu.storage_of("wanted", &[0_u32])?;
+        gpu.forget_bindings();
+        Ok(())
+    }
+
     /// Size of the depth map; none is 0 x 0.
     pub(super) fn depth_size(&self) -> [u32; 2] {
         match &self.training.depth {
@@ -246,6 +260,9 @@ fn is_whole(depth: &DepthMap) -> bool {
 }
 
 fn wanted(view: &TrainingView) -> Vec<u32> {
+    if view.image.is_hollow() {
+        return vec![0];
+    }
     let weights = view.mask.as_deref();
     let pixels = view.image.pixels.chunks_exact(3).enumerate();
     let mut words: Vec<u32> = pixels
@@ -276,7 +293,8 @@ fn mask_sum(view: &TrainingView) -> f32 {
 
 /// Over the pixels of the picture, each with the nearest pixel of the depth map.
 fn confidence_sum(view: &TrainingView) -> f32 {
-    let Some(depth) = view.depth.as_deref().filter(|depth| is_whole(depth)) else {
+    let depth = view.depth.as_deref().filter(|depth| is_whole(depth));
+    let Some(depth) = depth.filter(|_| !view.image.is_hollow()) else {
         return 0.0;
     };
     let (width, height) = (view.image.width_px as usize, view.image.height_px as usize);

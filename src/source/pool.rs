@@ -1,0 +1,93 @@
+//! Memory of pictures that nobody looks at any more, for the next ones: a camera's frames then cost no allocation.
+
+use std::sync::Arc;
+
+use crate::frame::RgbImage;
+use crate::source::decode::empty;
+
+/// Pictures that may be on their way at once: the queues hold six, select and track a few.
+const MAX_LENT: usize = 12;
+/// Pictures larger than this are few, and two dozen of them would be too much to keep.
+const MAX_LENT_BYTES: usize = 4 << 20;
+const MAX_SPARE: usize = 2;
+const MAX_SPARE_BYTES: usize = 32 << 20;
+
+#[derive(Debug, Default)]
+pub(super) struct Pool {
+    /// Handed out, and free again once the pool alone holds them. Those that became keyframes never are.
+    lent: Vec<Arc<RgbImage>>,
+    oldest: usize,
+    spare: Vec<RgbImage>,
+}
+
+impl Pool {
+    /// A picture to write into; its size and content are anything.
+    pub(super) fn spare(&mut self) -> RgbImage {
+        self.spare.pop().unwrap_or_else(empty)
+    }
+
+    pub(super) fn take_back(&mut self, picture: RgbImage) {
+        if self.spare.len() < MAX_SPARE && picture.pixels.capacity() <= MAX_SPARE_BYTES {
+            self.spare.push(picture);
+        }
+    }
+
+    /// The picture as frames carry it.
+    pub(super) fn lend(&mut self, picture: RgbImage) -> Arc<RgbImage> {
+        if picture.pixels.len() > MAX_LENT_BYTES {
+            return Arc::new(picture);
+        }
+        if let Some(ix) = self.lent.iter_mut().position(|p| Arc::get_mut(p).is_some()) {
+            let free = Arc::get_mut(&mut self.lent[ix]).expect("nobody else holds it");
+            let old = std::mem::replace(free, picture);
+            self.take_back(old);
+            return Arc::clone(&self.lent[ix]);
+        }
+        let lent = Arc::new(picture);
+        if self.lent.len() < MAX_LENT {
+            self.lent.push(Arc::clone(&lent));
+        } else {
+            self.lent[self.oldest] = Arc::clone(&lent);
+            self.oldest = (self.oldest + 1) % MAX_LENT;
+        }
+        lent
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(value: u8) -> RgbImage {
+        RgbImage {
+            width_px: 2,
+            height_px: 1,
+            pixels: vec![value; 6],
+        }
+    }
+
+    #[test]
+    fn a_picture_that_is_held_never_changes_and_a_free_one_is_used_again() {
+        let mut pool = Pool::default();
+        let held = pool.lend(picture(1));
+        let freed = pool.lend(picture(2));
+        let address = Arc::as_ptr(&freed);
+        drop(freed);
+        let third = pool.lend(picture(3));
+        assert_eq!((held.pixels[0], third.pixels[0]), (1, 3));
+        assert_eq!(Arc::as_ptr(&third), address);
+        assert_eq!(pool.spare().pixels, vec![2; 6]);
+    }
+
+    #[test]
+    fn the_pool_forgets_pictures_that_are_kept_for_ever() {
+        let mut pool = Pool::default();
+        let kept: Vec<_> = (0..100).map(|ix| pool.lend(picture(ix))).collect();
+        assert_eq!(pool.lent.len(), MAX_LENT);
+        assert!(
+            kept.iter()
+                .enumerate()
+                .all(|(ix, p)| p.pixels[0] == ix as u8)
+        );
+    }
+}

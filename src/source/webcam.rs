@@ -1,0 +1,216 @@
+//! Cameras by nokhwa, on any system. It knows neither sequence numbers nor error flags, and its reads never time out,
+//! so they are made on a thread of their own; pictures are stamped when they arrive.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use nokhwa::Camera as Nokhwa;
+use nokhwa::utils::{
+    CameraFormat, CameraIndex, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
+};
+
+use crate::clock::{Stamp, monotonic_nanos};
+use crate::config::{CameraParams, SourceParams};
+use crate::queue::{Received, Receiver, Sender, WhenFull, queue};
+use crate::source::SourceError;
+use crate::source::camera::live::Opener;
+use crate::source::camera::modes::{FORMATS, Offer, names, ranked};
+use crate::source::camera::stamps::ClockReading;
+use crate::source::camera::{Camera, CameraError, Layout, Shot};
+
+/// Drivers may take seconds to open a camera, but not this long.
+const OPEN_WITHIN: Duration = Duration::from_secs(10);
+/// Pictures that may wait; an older one is worth nothing.
+const PICTURES: usize = 2;
+
+/// What the reading thread says.
+enum News {
+    Open(Layout),
+    Picture {
+        bytes: Vec<u8>,
+        /// Of the pictures read, so that those show that had to make room.
+        sequence: u32,
+        arrived: ClockReading,
+    },
+    Failed(String),
+}
+
+/// A camera that streams on a thread of its own.
+struct Webcam {
+    name: String,
+    layout: Layout,
+    news: Receiver<News>,
+    /// Lent out as a `Shot`.
+    bytes: Vec<u8>,
+}
+
+/// Opens camera number `index`.
+pub fn opener(index: &str, params: &SourceParams) -> Result<Opener, SourceError> {
+    let uri = format!("webcam:{index}");
+    let Ok(index) = index.parse::<u32>() else {
+        return Err(SourceError::Uri { uri });
+    };
+    let wish = params.camera.clone();
+    let is_reading = Arc::new(AtomicBool::new(false));
+    Ok(Box::new(move || open(&uri, index, &wish, &is_reading)))
+}
+
+fn open(
+    name: &str,
+    index: u32,
+    wish: &CameraParams,
+    is_reading: &Arc<AtomicBool>,
+) -> Result<Box<dyn Camera>, CameraError> {
+    let fail = |reason: String| CameraError::Io {
+        what: "open the camera",
+        reason,
+        path: name.into(),
+    };
+    // A read that hangs cannot be ended; a second thread would only hang beside it.
+    if is_reading.swap(true, Ordering::AcqRel) {
+        return Err(fail("its driver hangs in the last read".to_owned()));
+    }
+    let (tx, news) = queue("webcam", PICTURES, WhenFull::DropOldest);
+    let (wish, is_done) = (wish.clone(), Arc::clone(is_reading));
+    let thread = std::thread::Builder::new().name("webcam".to_owned());
+    let started = thread.spawn(move || {
+        if let Err(reason) = read(index, &wish, &tx) {
+            tx.send(News::Failed(reason)).ok();
+        }
+        is_done.store(false, Ordering::Release);
+    });
+    started.map_err(|e| fail(e.to_string()))?;
+    match news.recv_timeout(OPEN_WITHIN) {
+        Received::Item(News::Open(layout)) => Ok(Box::new(Webcam {
+            name: name.to_owned(),
+            layout,
+            news,
+            bytes: Vec::new(),
+        })),
+        Received::Item(News::Failed(reason)) => Err(fail(reason)),
+        Received::Item(_) | Received::Nothing => Err(fail("its driver does not answer".to_owned())),
+        Received::Ended => Err(fail("its thread ended".to_owned())),
+    }
+}
+
+/// Reads until nobody listens.
+fn read(index: u32, wish: &CameraParams, tx: &Sender<News>) -> Result<(), String> {
+    let text = |e: nokhwa::NokhwaError| e.to_string();
+    let all = FORMATS.iter().filter_map(|format| theirs(format.name));
+    let all: Vec<FrameFormat> = all.collect();
+    let any = RequestedFormat::with_formats(RequestedFormatType::AbsoluteHighestFrameRate, &all);
+    let mut camera = Nokhwa::new(CameraIndex::Index(index), any).map_err(text)?;
+    let offers = offers(&camera.compatible_camera_formats().map_err(text)?);
+    let Some(mode) = ranked(&offers, wish).into_iter().next() else {
+        return Err(format!(
+            "none of the formats {}",
+            names(&wish.formats).collect::<Vec<_>>().join(", ")
+        ));
+    };
+    let format = theirs(mode.format.name).expect("offers are of known formats");
+    let rate = mode.interval.map_or(30, |(_, pictures)| pictures);
+    let size = Resolution::new(mode.width_px, mode.height_px);
+    let exact = RequestedFormatType::Exact(CameraFormat::new(size, format, rate));
+    let request = RequestedFormat::with_formats(exact, &all);
+    camera.set_camera_requset(request).map_err(text)?;
+    let taken = camera.camera_format();
+    if (taken.resolution(), taken.format()) != (size, format) {
+        return Err(format!("{mode} became {taken}"));
+    }
+    camera.open_stream().map_err(text)?;
+    let layout = Layout {
+        width_px: mode.width_px,
+        height_px: mode.height_px,
+        coding: mode.format.coding,
+        step: 0,
+        rate_hz: Some(f64::from(taken.frame_rate())),
+    };
+    let mut is_heard = tx.send(News::Open(layout)).is_ok();
+    let mut sequence = 0_u32;
+    while is_heard {
+        let bytes = camera.frame_raw().map_err(text)?.into_owned();
+        let picture = News::Picture {
+            bytes,
+            sequence,
+            arrived: read_clocks(),
+        };
+        sequence = sequence.wrapping_add(1);
+        is_heard = tx.send(picture).is_ok();
+    }
+    Ok(())
+}
+
+/// nokhwa's name of a format of ours.
+fn theirs(name: &str) -> Option<FrameFormat> {
+    match name {
+        "mjpeg" => Some(FrameFormat::MJPEG),
+        "yuyv" => Some(FrameFormat::YUYV),
+        "nv12" => Some(FrameFormat::NV12),
+        "grey" => Some(FrameFormat::GRAY),
+        "rgb24" => Some(FrameFormat::RAWRGB),
+        "bgr24" => Some(FrameFormat::RAWBGR),
+        _ => None,
+    }
+}
+
+fn offers(formats: &[CameraFormat]) -> Vec<Offer> {
+    let offer = |found: &CameraFormat| {
+        let format = FORMATS
+            .iter()
+            .find(|f| theirs(f.name) == Some(found.format()))?;
+        Some(Offer {
+            format: *format,
+            width_px: found.width(),
+            height_px: found.height(),
+            intervals: vec![(1, found.frame_rate().max(1))],
+        })
+    };
+    formats.iter().filter_map(offer).collect()
+}
+
+fn read_clocks() -> ClockReading {
+    let before_nanos = monotonic_nanos();
+    let wall = Stamp::now();
+    ClockReading {
+        before_nanos,
+        wall,
+        after_nanos: monotonic_nanos(),
+    }
+}
+
+impl Camera for Webcam {
+    fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    fn next(&mut self, wait: Duration) -> Result<Option<Shot<'_>>, CameraError> {
+        let gone = |reason: String| CameraError::Gone {
+            reason,
+            path: self.name.as_str().into(),
+        };
+        match self.news.recv_timeout(wait) {
+            Received::Item(News::Picture {
+                bytes,
+                sequence,
+                arrived,
+            }) => {
+                self.bytes = bytes;
+                Ok(Some(Shot {
+                    bytes: &self.bytes,
+                    sequence: Some(sequence),
+                    taken_nanos: Some(arrived.after_nanos),
+                    is_damaged: false,
+                    now: arrived,
+                }))
+            }
+            Received::Item(News::Failed(reason)) => Err(gone(reason)),
+            Received::Item(News::Open(_)) | Received::Nothing => Ok(None),
+            Received::Ended => Err(gone("its thread ended".to_owned())),
+        }
+    }
+
+    fn read_clocks(&self) -> ClockReading {
+        read_clocks()
+    }
+}
