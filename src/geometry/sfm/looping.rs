@@ -13,7 +13,7 @@ use super::adjusting::{adjust_global, adjust_local};
 use super::landmarks::{extend, join};
 use super::links::{pair_seed, release};
 use super::merging::similarity;
-use super::scene::{Component, Landmark, Link, NONE, Placed, Scene};
+use super::scene::{Component, Landmark, Link, NONE, Placed, Scene, Shot};
 use crate::camera::Intrinsics;
 use crate::geometry::pose_graph::{Graph, Tie, apart};
 use crate::geometry::two_view::median;
@@ -309,6 +309,13 @@ fn bend(scene: &mut Scene, component: u32, links: &[&Candidate]) -> bool {
     true
 }
 
+struct KeptShot {
+    placed: Option<Placed>,
+    landmark_of: Vec<u32>,
+    matched: Vec<Vec<(u32, u32)>>,
+    lens: Intrinsics,
+}
+
 /// All that closing a loop may change.
 struct Backup {
     landmarks: Vec<Landmark>,
@@ -316,13 +323,17 @@ struct Backup {
     links: BTreeMap<(usize, usize), Link>,
     held: BTreeMap<(usize, usize), Link>,
     radial: f64,
-    shots: Vec<(Option<Placed>, Vec<u32>, Vec<Vec<(u32, u32)>>, Intrinsics)>,
+    shots: Vec<KeptShot>,
 }
 
 impl Backup {
     fn of(scene: &Scene) -> Self {
-        let shot =
-            |s: &super::scene::Shot| (s.placed, s.landmark_of.clone(), s.matched.clone(), s.lens);
+        let shot = |shot: &Shot| KeptShot {
+            placed: shot.placed,
+            landmark_of: shot.landmark_of.clone(),
+            matched: shot.matched.clone(),
+            lens: shot.lens,
+        };
         Self {
             landmarks: scene.landmarks.clone(),
             components: scene.components.clone(),
@@ -336,9 +347,9 @@ impl Backup {
     fn put_back(self, scene: &mut Scene) {
         (scene.landmarks, scene.components) = (self.landmarks, self.components);
         (scene.links, scene.held, scene.radial) = (self.links, self.held, self.radial);
-        for (shot, (placed, landmark_of, matched, lens)) in scene.shots.iter_mut().zip(self.shots) {
-            (shot.placed, shot.landmark_of) = (placed, landmark_of);
-            (shot.matched, shot.lens) = (matched, lens);
+        for (shot, kept) in scene.shots.iter_mut().zip(self.shots) {
+            (shot.placed, shot.landmark_of) = (kept.placed, kept.landmark_of);
+            (shot.matched, shot.lens) = (kept.matched, kept.lens);
         }
         scene.straighten();
     }
