@@ -263,9 +263,9 @@ fn bend(scene: &mut Scene, component: u32, links: &[&Candidate]) -> bool {
     let before: Vec<Similarity> = shots.iter().map(|s| pose(s).into()).collect();
     let depths: Vec<f64> = shots.iter().map(|s| depth(scene, *s)).collect();
     let mut ties = Vec::new();
-    for second in 1..shots.len() {
+    for (second, depth) in depths.iter().enumerate() {
         let near = second.saturating_sub(N_TIED)..second;
-        ties.extend(near.map(|first| Tie::as_is(&before, (first, second), depths[second])));
+        ties.extend(near.map(|first| Tie::as_is(&before, (first, second), *depth)));
     }
     let ix = |(a, b): (usize, usize)| Some((*ix_of.get(&a)?, *ix_of.get(&b)?));
     let closed = scene.closed.iter().filter_map(|ends| ix(*ends));
