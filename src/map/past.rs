@@ -74,7 +74,11 @@ impl SplatMap {
             Some(Tracker::in_saved(&saved.landmarks, &track)?)
         };
         let snapshot = &saved.snapshot;
-        let first_id = snapshot.poses.last().map_or(0, |pose| pose.keyframe_id + 1);
+        let last_id = snapshot.poses.iter().map(|pose| pose.keyframe_id).max();
+        let first_id = match last_id {
+            Some(id) => id.checked_add(1).ok_or("its keyframes leave no ids")?,
+            None => 0,
+        };
         self.scale = snapshot.scale;
         (self.epoch, self.revision) = (snapshot.epoch, snapshot.revision);
         self.component = Some(SAVED);

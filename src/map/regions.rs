@@ -25,6 +25,8 @@ const NEAR: f64 = 4.0;
 const FAR: f64 = 6.0;
 /// Room that is made beyond what is wanted, as a share of the cap: taking splats away costs a pass over all.
 const SPARE: f64 = 0.05;
+/// One part of so many of the cap is the most that is made free for new keyframes.
+const MOST_WANTED: usize = 4;
 /// Of a region: places that stand for it, those of them that a view must show, and how far off, in depths of the scene.
 const N_SAMPLES: usize = 12;
 const MIN_SEEN: usize = 3;
@@ -80,6 +82,8 @@ impl SplatMap {
     pub(super) fn balance(&mut self, n_wanted: usize) {
         let most = self.most_splats();
         let n = self.engine.n_splats();
+        // Keyframes seldom add all that they may.
+        let n_wanted = n_wanted.min(most / MOST_WANTED);
         let is_full = n + n_wanted > most;
         if !is_full && self.regions.on_disk.is_empty() {
             return;

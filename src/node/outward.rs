@@ -8,8 +8,9 @@ use std::time::Duration;
 use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::export::ply;
-use crate::map::SplatMap;
 use crate::map::snapshot::Snapshot;
+use crate::map::{SplatMap, checkpoint};
+use crate::node::Stop;
 use crate::publish::PublishError;
 use crate::publish::outbox::Outbox;
 use crate::publish::overview::SeenKeyframe;
@@ -19,7 +20,7 @@ use crate::queue::{Received, Receiver};
 use crate::track::Tracker;
 
 /// Transforms go out at least so often: consumers like to look back no further (Nav2: 10 Hz, better 20).
-const REPEAT: Duration = Duration::from_millis(40);
+const REPEAT: Duration = Duration::from_millis(30);
 const STATUS_SECS: f64 = 1.0;
 /// Seconds between words of the same trouble.
 const COMPLAIN_SECS: f64 = 10.0;
@@ -110,6 +111,9 @@ fn publish(outbox: &Outbox, (snapshot, is_last): &Outgoing) -> Result<(), Publis
 /// What calls from outside are answered with, besides the map.
 #[derive(Debug)]
 pub(super) struct Clerk {
+    /// To begin again from a saved map; `None` once the input has ended.
+    stop: Option<Stop>,
+    wanted: String,
     calls: Option<Calls<Call>>,
     track: TrackParams,
     /// What the tracker tells of its landmarks now and then, and the newest of it.
@@ -118,9 +122,11 @@ pub(super) struct Clerk {
 }
 
 impl Clerk {
-    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams) -> Self {
+    pub(super) fn new(calls: Option<Calls<Call>>, track: &TrackParams, stop: Stop) -> Self {
         Self {
             calls,
+            stop: Some(stop),
+            wanted: String::new(),
             track: track.clone(),
             told: None,
             landmarks: Vec::new(),
@@ -175,9 +181,10 @@ impl Clerk {
                     written.map_err(|e| e.to_string()),
                 )
             }
-            Request::Load(_) => Answer::Refused(
-                "a running map is not replaced: start the node on the saved one".to_owned(),
-            ),
+            Request::Load(path) => match self.load(path) {
+                Ok(()) => Answer::Done("mapping goes on from the saved map".to_owned()),
+                Err(reason) => Answer::Refused(reason),
+            },
             Request::Render {
                 splats_from_cam,
                 intrinsics,
@@ -186,6 +193,30 @@ impl Clerk {
                 None => Answer::Refused("there is no map yet".to_owned()),
             },
         }
+    }
+
+    /// The map that mapping is to go on from after a restart; empty for a fresh one.
+    pub(super) fn take_wanted(&mut self) -> String {
+        std::mem::take(&mut self.wanted)
+    }
+
+    /// No restart from here on: the input has ended.
+    pub(super) fn at_end(mut self) -> Self {
+        self.stop = None;
+        self
+    }
+
+    /// What cannot be read is refused, and the present map goes on.
+    fn load(&mut self, path: &Path) -> Result<(), String> {
+        let Some(stop) = &self.stop else {
+            return Err("the input has ended; start a run on the saved map with --map".to_owned());
+        };
+        let saved = checkpoint::read(path).map_err(|e| e.to_string())?;
+        Tracker::in_saved(&saved.landmarks, &self.track)
+            .map_err(|reason| format!("no camera could be found in that map: {reason}"))?;
+        self.wanted = path.to_string_lossy().into_owned();
+        stop.ask_restart();
+        Ok(())
     }
 
     /// With landmarks, so that a later run finds its place.

@@ -35,7 +35,7 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
     let watch = Stopwatch::start();
     let mut calls = None;
     loop {
-        let (params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
+        let (mut params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
         let (is_live, out) = (job.is_live, job.out.clone());
         let mut ended = run_once(job, calls.take(), on_progress)?;
         if !stop.takes_restart() {
@@ -45,6 +45,7 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
         }
         tracing::info!("the map begins again");
         calls = ended.map.clerk.take_calls();
+        params.map.load = ended.map.clerk.take_wanted();
         job = Job {
             source: ended.source.into_source(),
             params,
@@ -276,7 +277,7 @@ impl End {
             tracking: self.tracking,
             keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
-            clerk: self.map.clerk,
+            clerk: self.map.clerk.at_end(),
             map: self.map.map,
             geometry_note: self.geometry.note,
             error: self.error.or(fault),

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::process::Command;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use glam::{DQuat, DVec3};
 use splat_mapper::config::{Params, Settings};
@@ -16,7 +16,7 @@ use splat_mapper::splat::Engine as _;
 use splat_mapper::splat::cpu::CpuEngine;
 
 /// Fast enough for a test, sharp enough to be recognised.
-const ROOM: &str = "synthetic:room?frames=44&width=208&height=156&speed=1.3";
+const ROOM: &str = "synthetic:room?frames=42&width=192&height=144&speed=1.3";
 const STEPS: u64 = 240;
 
 /// Frames that are given one by one, as a camera of another session gives them.
@@ -49,10 +49,14 @@ impl Source for Frames {
     }
 }
 
-fn room() -> Vec<Frame> {
-    let params = Settings::shipped().params().unwrap();
-    let mut source = open(ROOM, &params.source, 0).unwrap();
-    std::iter::from_fn(|| source.next()).collect()
+/// Made once: the tests share the pictures.
+fn room() -> &'static [Frame] {
+    static FRAMES: LazyLock<Vec<Frame>> = LazyLock::new(|| {
+        let params = Settings::shipped().params().unwrap();
+        let mut source = open(ROOM, &params.source, 0).unwrap();
+        std::iter::from_fn(|| source.next()).collect()
+    });
+    &FRAMES
 }
 
 /// The same as seen by a session with a frame and a unit of its own.

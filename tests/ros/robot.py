@@ -95,6 +95,7 @@ class Robot:
     """Publishes the recording on a thread of its own, at `rate` times its speed."""
 
     def __init__(self, node, recording, picture_type=Image, with_odometry=True):
+        self.node = node
         self.is_stopping = threading.Event()
         self.with_odometry = with_odometry
         self.n_sent = 0
@@ -115,6 +116,12 @@ class Robot:
         self.to_clock = publisher(Clock, "/clock", SENSOR)
         self.to_tf_static.publish(TFMessage(transforms=[mount()]))
         self.thread = None
+
+    def close(self):
+        """Takes its publishers away."""
+        publishers = [self.to_picture, self.to_info, self.to_depth, self.to_pose]
+        for publisher in [*publishers, self.to_tf, self.to_tf_static, self.to_clock]:
+            self.node.destroy_publisher(publisher)
 
     def start(self, rate=1.0, from_ix=0, to_ix=None, offset_nanos=0):
         """`offset_nanos` is added to every stamp: later passes of the recording are later times."""

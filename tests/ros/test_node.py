@@ -1,6 +1,8 @@
 """What the node is to ROS 2 before it maps anything: names, parameters, lifecycle, silence, jumps of time, lost pictures."""
 
 import json
+import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -151,6 +153,7 @@ def silence(observer, recording):
     robot.start(to_ix=20)
     check("QoS that does not suit is told", mapper.wait_for_log("set it to best_effort", 5.0))
     robot.stop()
+    robot.close()
     mapper.end()
 
     mapper = Mapper(*SOURCE, *IDLE, "--set", "ros2.image_transport=compressed", "--set", "ros2.silence_secs=0.5", log="transport.log")
@@ -165,6 +168,18 @@ def silence(observer, recording):
     check("a camera without CameraInfo is waited for, then taken as uncalibrated", late.wait_for_log("counts as uncalibrated", 6.0))
     late.end()
     observer.node.destroy_publisher(publisher)
+
+
+def doctor(observer, recording):
+    robot = Robot(observer.node, recording)
+    told = subprocess.run([os.environ["SPLAT_MAPPER"], "doctor"], capture_output=True, text=True, check=False, cwd=ROOT).stdout
+    found = [line for line in told.splitlines() if "ros 2 pictures" in line]
+    wanted = "/camera/image_raw (sensor_msgs/msg/Image, best effort, by /observer, with CameraInfo)"
+    check("doctor sees the camera, how it publishes, and its calibration", any(wanted in line for line in found), found)
+    robot.close()
+    off = Mapper(*SOURCE, "--set", "ros2.enabled=off", log="off.log")
+    off.process.wait(10)
+    check("a ROS source without the node is refused", "ros2.enabled=off" in off.log(), off.log().strip()[-200:])
 
 
 def time_jumps(observer, recording):
@@ -182,6 +197,7 @@ def time_jumps(observer, recording):
         if action == "end":
             check("and the process ends by itself", wait_until(lambda: mapper.process.poll() is not None, 5.0))
         mapper.end()
+        robot.close()
 
 
 def throughput(observer):
@@ -218,6 +234,7 @@ def main():
     parameters(observer)
     lifecycle(observer)
     silence(observer, recording)
+    doctor(observer, recording)
     time_jumps(observer, recording)
     throughput(observer)
     observer.close()

@@ -23,8 +23,9 @@ use crate::source::truth::{Track, Transforms};
 const KEPT_NANOS: i64 = 30_000_000_000;
 /// And looked through after so many messages.
 const TIDY_EVERY: u32 = 256;
-/// Depth pictures that wait for their picture; each of at most a picture's size.
-const MAX_DEPTHS: usize = 4;
+/// Depth pictures that wait for their picture, which may wait for calibration; and memory for them.
+const MAX_DEPTHS: usize = 32;
+const MAX_DEPTH_BYTES: usize = 64 << 20;
 /// A true pose counts for a picture so near in time.
 const TRUTH_WITHIN_NANOS: i64 = 50_000_000;
 
@@ -123,8 +124,10 @@ impl Beside {
                     if let Some(stamp) = header_stamp(&payload, 0) {
                         let depths = &mut lock(&heard).depths;
                         depths.push_back((stamp, payload));
-                        let excess = depths.len().saturating_sub(MAX_DEPTHS);
-                        depths.drain(..excess);
+                        let n_bytes: usize = depths.iter().map(|(_, payload)| payload.len()).sum();
+                        if depths.len() > MAX_DEPTHS || n_bytes > MAX_DEPTH_BYTES {
+                            depths.pop_front();
+                        }
                     }
                     true
                 },
