@@ -55,6 +55,8 @@ pub fn look_around() -> Result<Vec<String>, LinkError> {
     while picture_topics(&link).is_empty() && watch.elapsed() < DISCOVERY {
         std::thread::sleep(DISCOVERY / 20);
     }
+    // Who publishes is known a little later than what.
+    std::thread::sleep(DISCOVERY / 8);
     let describe = |topic: String| {
         let peers = link.publishers(&topic).unwrap_or_default();
         let Some(peer) = peers.first() else {
