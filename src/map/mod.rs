@@ -331,22 +331,8 @@ impl SplatMap {
             let factor = map_from_model.scale * given.map_or(1.0, |placed| placed.depth_factor);
             let depth = Arc::new(keyframes::rescaled(&view.depth, factor));
             let median_depth = depth.median();
-            if let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) {
-                if placed.lens != view.lens && placed.home.is_here {
-                    let max_side = self.params.max_side;
-                    let (image, pinhole) = keyframes::picture(&placed.keyframe, &view, max_side);
-                    (placed.image, placed.intrinsics) = (Arc::clone(&image), pinhole);
-                    placed.lens = view.lens;
-                    self.engine.set_image(placed.view_ix, image, &pinhole);
-                }
-                // A shared keyframe: more neighbours have verified its depth since, unless it is out of reach.
-                if depth.width_px > 0 && placed.home.is_here {
-                    self.engine
-                        .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
-                    (placed.depth, placed.median_depth) = (depth, median_depth);
-                    placed.ratios = None;
-                }
-                placed.health = view.health;
+            if self.has_keyframe(view.keyframe_id) {
+                self.told_again(&view, depth);
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
                 let (image, intrinsics) =
                     keyframes::picture(&keyframe, &view, self.params.max_side);

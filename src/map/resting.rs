@@ -10,7 +10,7 @@ use rand::RngExt;
 use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::View;
 use crate::map::SplatMap;
-use crate::map::keyframes::Placed;
+use crate::map::keyframes::{self, Placed};
 use crate::map::saved_view::{self, Content, SavedView};
 use crate::map::spill::{Slot, Spill};
 
@@ -211,6 +211,33 @@ impl SplatMap {
             placed.image = Arc::new(RgbImage::hollow(w, h));
             placed.depth = Arc::new(DepthMap::none());
             self.engine.rest_view(placed.view_ix);
+        }
+    }
+
+    /// A keyframe of which the model tells once more: more neighbours have verified its depth since, unless it is out of
+    /// reach.
+    pub(super) fn told_again(&mut self, view: &View, depth: Arc<DepthMap>) {
+        let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) else {
+            return;
+        };
+        placed.health = view.health;
+        if !placed.home.is_here {
+            return;
+        }
+        if placed.lens != view.lens && !placed.keyframe.frame.image.is_hollow() {
+            let max_side = self.params.max_side;
+            let (image, pinhole) = keyframes::picture(&placed.keyframe, view, max_side);
+            (placed.image, placed.intrinsics) = (Arc::clone(&image), pinhole);
+            placed.lens = view.lens;
+            placed.home.copy = None;
+            self.engine.set_image(placed.view_ix, image, &pinhole);
+        }
+        if depth.width_px > 0 {
+            self.engine
+                .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
+            (placed.median_depth, placed.depth) = (depth.median(), depth);
+            placed.ratios = None;
+            placed.home.copy = None;
         }
     }
 

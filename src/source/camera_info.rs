@@ -94,9 +94,8 @@ pub fn of_yaml(text: &str) -> Result<CameraInfo, String> {
 }
 
 fn array<const N: usize>(data: Vec<f64>, name: &str) -> Result<[f64; N], String> {
-    let n_found = data.len();
     data.try_into()
-        .map_err(|_: Vec<f64>| format!("{name} has {n_found} numbers, expected {N}"))
+        .map_err(|data: Vec<f64>| format!("{name} has {} numbers, expected {N}", data.len()))
 }
 
 #[cfg(test)]

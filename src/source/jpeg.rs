@@ -263,9 +263,9 @@ mod tests {
 
     #[test]
     fn markers_that_run_off_the_end_are_no_picture() {
-        assert_eq!(super::whole(&[0xff, 0xd8, 0xff]), None);
-        assert_eq!(super::whole(&[0xff, 0xd8, 0xff, 0xe0, 0xff, 0xff]), None);
-        assert_eq!(super::whole(&[0xff, 0xd8, 0xff, 0xd9]), None);
-        assert_eq!(super::whole(b"\x89PNG"), None);
+        assert_eq!(whole(&[0xff, 0xd8, 0xff]), None);
+        assert_eq!(whole(&[0xff, 0xd8, 0xff, 0xe0, 0xff, 0xff]), None);
+        assert_eq!(whole(&[0xff, 0xd8, 0xff, 0xd9]), None);
+        assert_eq!(whole(b"\x89PNG"), None);
     }
 }

@@ -150,6 +150,7 @@ pub fn camera_opener(uri: &str, params: &SourceParams) -> Option<Result<Opener, 
 }
 
 #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
+#[allow(clippy::unnecessary_wraps, reason = "builds without it refuse")]
 fn v4l2_opener(path: &str, params: &SourceParams) -> Result<Opener, SourceError> {
     Ok(v4l2::opener(Path::new(path), params))
 }

@@ -145,8 +145,8 @@ fn remap(source: &[u8], row_bytes: usize, taps: &[Tap], target: &mut [u8]) {
 fn mix<const N: usize>(source: &[u8], row_bytes: usize, taps: &[Tap; N], target: &mut [u8]) {
     let mut upper = [[0; N]; 2];
     let mut lower = [[0; N]; 2];
-    for ix in 0..N {
-        let at = taps[ix].offset as usize;
+    for (ix, tap) in taps.iter().enumerate() {
+        let at = tap.offset as usize;
         let two = |at: usize| {
             let bytes = source[at..at + 8].first_chunk().expect("eight bytes");
             u64::from_le_bytes(*bytes)
@@ -156,8 +156,8 @@ fn mix<const N: usize>(source: &[u8], row_bytes: usize, taps: &[Tap; N], target:
         (lower[0][ix], lower[1][ix]) = (below as u32, (below >> 24) as u32);
     }
     let mut mixed = [0_u32; N];
-    for ix in 0..N {
-        let (right, below) = (u32::from(taps[ix].right), u32::from(taps[ix].below));
+    for (ix, (tap, mixed)) in taps.iter().zip(&mut mixed).enumerate() {
+        let (right, below) = (u32::from(tap.right), u32::from(tap.below));
         let both = (right * below + WHOLE / 2) / WHOLE;
         let weights = [
             WHOLE + both - right - below,
@@ -171,7 +171,7 @@ fn mix<const N: usize>(source: &[u8], row_bytes: usize, taps: &[Tap; N], target:
             let sum = a * weights[0] + b * weights[1] + c * weights[2] + d * weights[3];
             (sum + WHOLE / 2) / WHOLE
         };
-        mixed[ix] = channel(0) | channel(8) << 8 | channel(16) << 16;
+        *mixed = channel(0) | channel(8) << 8 | channel(16) << 16;
     }
     for (pixel, target) in mixed.iter().zip(target.chunks_exact_mut(3)) {
         target.copy_from_slice(&pixel.to_le_bytes()[..3]);

@@ -111,9 +111,9 @@ fn read(index: u32, wish: &CameraParams, tx: &Sender<News>) -> Result<(), String
     let format = theirs(mode.format.name).expect("offers are of known formats");
     let rate = mode.interval.map_or(30, |(_, pictures)| pictures);
     let size = Resolution::new(mode.width_px, mode.height_px);
-    camera
-        .set_camera_format(CameraFormat::new(size, format, rate))
-        .map_err(text)?;
+    let exact = RequestedFormatType::Exact(CameraFormat::new(size, format, rate));
+    let request = RequestedFormat::with_formats(exact, &all);
+    camera.set_camera_requset(request).map_err(text)?;
     let taken = camera.camera_format();
     if (taken.resolution(), taken.format()) != (size, format) {
         return Err(format!("{mode} became {taken}"));

@@ -48,10 +48,12 @@ fn wait_for(health: &HealthWatch, is_wanted: impl Fn(&Health) -> bool, within: f
 fn in_background(mut source: CameraSource) -> (Arc<AtomicBool>, impl FnOnce() -> CameraSource) {
     let asked = Arc::new(AtomicBool::new(false));
     source.end_when(&asked);
-    let reader = std::thread::spawn(move || {
-        while source.next().is_some() {}
-        source
-    });
+    let reader = std::thread::Builder::new()
+        .spawn(move || {
+            while source.next().is_some() {}
+            source
+        })
+        .unwrap();
     (asked, move || reader.join().unwrap())
 }
 
@@ -197,7 +199,9 @@ fn pictures_that_are_too_short_or_no_jpeg_are_counted_and_the_rest_goes_on() {
     );
     let asked = Arc::new(AtomicBool::new(false));
     source.end_when(&asked);
-    let reader = std::thread::spawn(move || (source.next().is_none(), source.counts().undecodable));
+    let reader = std::thread::Builder::new()
+        .spawn(move || (source.next().is_none(), source.counts().undecodable))
+        .unwrap();
     while !script.is_played() {
         std::thread::yield_now();
     }

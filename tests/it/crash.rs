@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rand::{RngExt as _, SeedableRng as _};
+use splat_mapper::clock::Stopwatch;
 use splat_mapper::map::checkpoint::{self, Checkpoint};
 use splat_mapper::map::snapshot::Snapshot;
 
@@ -89,14 +90,14 @@ fn a_run_that_dies_leaves_the_last_autosave() {
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    let watch = std::time::Instant::now();
+    let watch = Stopwatch::start();
     let load = || {
         checkpoint::read(&map)
             .ok()
             .filter(|c| !c.landmarks.is_empty())
     };
     let mut loaded = None;
-    while loaded.is_none() && watch.elapsed() < Duration::from_secs(50) {
+    while loaded.is_none() && watch.secs() < 50.0 {
         std::thread::sleep(Duration::from_millis(20));
         loaded = load();
     }

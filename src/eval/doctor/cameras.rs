@@ -6,7 +6,7 @@ const NONE_FIX: &str = "plug a camera in; in a container, pass it on with --devi
 
 #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
 pub(super) fn cameras() -> Check {
-    check_of(crate::source::v4l2::list::list())
+    check_of(&crate::source::v4l2::list::list())
 }
 
 #[cfg(not(all(feature = "camera-v4l", target_os = "linux")))]
@@ -33,7 +33,7 @@ mod found {
 
     type Listed = (PathBuf, Result<Found, CameraError>);
 
-    pub(super) fn check_of(cameras: Vec<Listed>) -> Check {
+    pub(super) fn check_of(cameras: &[Listed]) -> Check {
         if cameras.is_empty() {
             return Check::optional(
                 "camera",
@@ -112,10 +112,10 @@ mod found {
 
         #[test]
         fn cameras_are_listed_with_what_they_offer_and_what_is_in_the_way() {
-            assert_eq!(check_of(Vec::new()).state, State::Optional);
+            assert_eq!(check_of(&[]).state, State::Optional);
             let path = PathBuf::from("/dev/video2");
             let locked = CameraError::Permission { path: path.clone() };
-            let check = check_of(vec![(path.clone(), Err(locked))]);
+            let check = check_of(&[(path.clone(), Err(locked))]);
             assert_eq!(check.state, State::Optional);
             assert!(check.fix.unwrap().contains("usermod -aG video"));
             let offer = |ix: usize, width_px, rates: &[u32]| Offer {
@@ -137,7 +137,7 @@ mod found {
                 others: vec!["H264".to_owned()],
                 controls: vec!["gain=0..255".to_owned()],
             };
-            let check = check_of(vec![(path, Ok(found))]);
+            let check = check_of(&[(path, Ok(found))]);
             assert_eq!(check.state, State::Ok);
             assert_eq!(
                 check.found,

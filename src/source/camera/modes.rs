@@ -89,11 +89,14 @@ impl std::fmt::Display for Mode {
     }
 }
 
+/// Size class, pixels off, whether it is too slow, place in the order of formats, thousandths of a Hz off.
+type Key = (u8, u64, bool, usize, u64);
+
 /// Modes to try, the best first: the size nearest to the wanted one and no smaller, else the largest; of that size
 /// those that reach the rate; of those the first by `formats`; of that the rate nearest above.
 pub fn ranked(offers: &[Offer], wish: &CameraParams) -> Vec<Mode> {
     let order: Vec<&str> = names(&wish.formats).collect();
-    let mut modes: Vec<((u8, u64, bool, usize, u64), Mode)> = offers
+    let mut modes: Vec<(Key, Mode)> = offers
         .iter()
         .filter_map(|offer| {
             let preference = order.iter().position(|name| *name == offer.format.name)?;

@@ -336,7 +336,6 @@ impl Stream {
         unsafe { slice::from_raw_parts(map.start.cast::<u8>(), n_bytes) }
     }
 
-    #[expect(clippy::needless_pass_by_value, reason = "a buffer is given back once")]
     pub(super) fn give_back(&mut self, filled: Filled) -> io::Result<()> {
         self.queue(filled.index)
     }
