@@ -217,7 +217,8 @@ mod tests {
         let compressed = peer(CompressedImage::TYPE_NAME, true);
         assert!(say(loose, &[compressed], &[]).contains("image_transport"));
         let best_effort = peer(Image::TYPE_NAME, false);
-        assert!(say(strict, &[best_effort.clone()], &[]).contains("best_effort"));
-        assert!(say(loose, &[best_effort], &[]).contains("fastdds.xml"));
+        let one = [best_effort];
+        assert!(say(strict, &one, &[]).contains("best_effort"));
+        assert!(say(loose, &one, &[]).contains("fastdds.xml"));
     }
 }
