@@ -65,7 +65,7 @@ def names_and_arguments(observer):
     check("without a picture it ends at once, and says that there is no map", code == 1 and secs < 2.0, f"{code}, {secs:.2f} s")
     for arguments, expected in [
         (["-p", "map.steps:=-1"], "parameter map.steps = -1 is out of range"),
-        (["-p", "map.stepps:=1"], "nearest is"),
+        (["-p", "map.stepps:=1"], "unknown parameter"),
         (["-r", "what is this"], "ROS 2 does not start"),
     ]:
         mapper = Mapper(*SOURCE, *IDLE, "--ros-args", *arguments, log="arguments.log")

@@ -129,7 +129,6 @@ fn qos(delivery: Delivery) -> QosProfile {
 mod tests {
     use std::path::{Path, PathBuf};
 
-    use super::*;
     use crate::publish::outbox::TOPICS;
     use crate::publish::service::SERVICES;
     use crate::publish::type_hash::{hash_of, service_hash};
