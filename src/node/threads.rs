@@ -6,7 +6,8 @@ use anyhow::anyhow;
 
 use crate::frame::{Batch, Frame};
 use crate::geometry::{GeometryBatch, GeometryError};
-use crate::node::stages::{GeometryStage, SelectStage, SourceStage};
+use crate::node::source_stage::SourceStage;
+use crate::node::stages::{GeometryStage, SelectStage};
 use crate::node::track_stage::{Heard, tell};
 use crate::queue::{Receiver, Sender};
 
