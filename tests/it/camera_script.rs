@@ -28,8 +28,6 @@ pub enum Step {
     Unplugged { secs: f64 },
     /// No picture for ever, until it is opened again.
     Hang,
-    /// Ends the script: the camera sleeps.
-    End,
 }
 
 pub fn picture(sequence: u32) -> Step {
@@ -164,10 +162,6 @@ impl Camera for Scripted {
             }
             Step::Hang => {
                 self.is_hanging = true;
-                Ok(None)
-            }
-            Step::End => {
-                stage.steps.clear();
                 Ok(None)
             }
         }
