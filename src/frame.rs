@@ -107,6 +107,13 @@ impl DepthMap {
         }
     }
 
+    /// The same in another unit, `factor` of which make one of the old.
+    pub fn scale(&mut self, factor: f64) {
+        for value in &mut self.depth {
+            *value = (f64::from(*value) * factor) as f32;
+        }
+    }
+
     /// Depth and confidence of pixel `at`; `None` where no depth was verified.
     pub fn verified(&self, at: usize) -> Option<(f32, f32)> {
         let (depth, confidence) = (*self.depth.get(at)?, *self.confidence.get(at)?);

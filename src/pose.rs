@@ -137,11 +137,44 @@ impl Similarity {
         self.rotation * point * self.scale + self.translation
     }
 
+    pub fn is_finite(&self) -> bool {
+        let is_scale = self.scale.is_finite() && self.scale > 0.0;
+        is_scale && self.rotation.is_finite() && self.translation.is_finite()
+    }
+
+    /// Radians.
+    pub fn angle(&self) -> f64 {
+        let vector = DVec3::new(self.rotation.x, self.rotation.y, self.rotation.z);
+        2.0 * vector.length().atan2(self.rotation.w.abs())
+    }
+
     /// `self * source_from_cam`: the camera keeps unit scale, only its place and heading move.
     pub fn transform_pose(&self, pose: &Rigid) -> Rigid {
         Rigid {
             rotation: self.rotation * pose.rotation,
             translation: self.transform_point(pose.translation),
+        }
+    }
+}
+
+impl std::ops::Mul for Similarity {
+    type Output = Self;
+
+    fn mul(self, rhs: Self) -> Self {
+        Self {
+            scale: self.scale * rhs.scale,
+            rotation: self.rotation * rhs.rotation,
+            translation: self.transform_point(rhs.translation),
+        }
+    }
+}
+
+impl From<Rigid> for Similarity {
+    fn from(rigid: Rigid) -> Self {
+        Self {
+            scale: 1.0,
+            rotation: rigid.rotation,
+            translation: rigid.translation,
         }
     }
 }

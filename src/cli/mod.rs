@@ -153,7 +153,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 #[derive(Debug, Args)]
 struct SynthArgs {
-    /// room, facade or corridor
+    /// room, facade, corridor or hallway
     scene: String,
     /// Recording to write; its poses go beside it as .tum
     #[arg(long, value_name = "FILE.mcap")]

@@ -30,6 +30,8 @@ pub struct AlignParams {
     pub join: JoinBy,
     pub history: usize,
     pub whole: usize,
+    pub loops: bool,
+    pub max_drift: f64,
     pub min_inliers: f64,
     pub max_scale_jump: f64,
     pub max_turn_deg: f64,

@@ -143,6 +143,8 @@ pub struct SfmParams {
     pub max_error_px: f64,
     pub focal_guess: f64,
     pub old_poses: OldPoses,
+    pub loops: bool,
+    pub max_drift: f64,
 }
 
 #[derive(Debug, Clone, PartialEq, Deserialize)]

@@ -24,6 +24,8 @@ pub struct PublishParams {
     pub camera_frame: String,
     pub tf: TfMode,
     pub tf_tolerance: f64,
+    pub slew_speed: f64,
+    pub slew_turn_deg: f64,
     pub mount: String,
     pub folder: String,
     pub linger_secs: f64,

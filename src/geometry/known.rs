@@ -101,6 +101,7 @@ impl Known {
             batch_id: batch.id,
             views: joined.views,
             revised: joined.revised,
+            is_loop: joined.is_loop,
             note: joined.note,
             ..GeometryBatch::default()
         })

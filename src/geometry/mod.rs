@@ -9,10 +9,12 @@ pub mod matching;
 pub mod mvs;
 pub mod onnx;
 pub mod pnp;
+pub mod pose_graph;
 pub mod scale_space;
 pub mod sfm;
 pub mod triangulate;
 pub mod two_view;
+pub mod umeyama;
 pub mod uncertainty;
 
 use crate::camera::{Intrinsics, Lens};
@@ -81,6 +83,8 @@ pub struct Revision {
     pub component: u32,
     pub intrinsics: Intrinsics,
     pub batch_from_cam: Rigid,
+    /// In the unit of the pose, what was told of its depth is so many times as long; 1 where only the pose moved.
+    pub depth_factor: f64,
 }
 
 /// Standard deviation of poses that the model itself states; 0 where it states none and poses are taken for good.
@@ -112,6 +116,8 @@ pub struct GeometryBatch {
     pub pose_error: PoseError,
     /// Of models that match points; empty from others.
     pub sightings: Vec<Sightings>,
+    /// A place was seen again since: `revised` brings both ends of the way together.
+    pub is_loop: bool,
     /// Why keyframes are missing, one plain sentence, for status and errors.
     pub note: Option<String>,
 }
@@ -123,8 +129,13 @@ impl GeometryBatch {
             let id = news.keyframe_id;
             if let Some(view) = self.views.iter_mut().find(|v| v.keyframe_id == id) {
                 (view.batch_from_cam, view.intrinsics) = (news.batch_from_cam, news.intrinsics);
+                view.component = news.component;
+                view.depth.scale(news.depth_factor);
             } else if let Some(old) = self.revised.iter_mut().find(|r| r.keyframe_id == id) {
-                *old = news;
+                *old = Revision {
+                    depth_factor: old.depth_factor * news.depth_factor,
+                    ..news
+                };
             } else {
                 self.revised.push(news);
             }

@@ -76,18 +76,20 @@ fn mean_rotation(rotations: impl Iterator<Item = DQuat>) -> DQuat {
     }
 }
 
-/// A motion of cameras that carries splats along: their means, orientations and view-dependent colours.
+/// A motion of cameras that carries splats along: their means, sizes, orientations and view-dependent colours.
 #[derive(Debug, Clone)]
 pub struct Carry {
-    motion: Rigid,
+    motion: Similarity,
+    log_scale: f32,
     bands: ShRotation,
 }
 
 impl Carry {
     /// For splats of this SH degree.
-    pub fn new(motion: Rigid, sh_degree: u8) -> Self {
+    pub fn new(motion: Similarity, sh_degree: u8) -> Self {
         Self {
             bands: ShRotation::new(motion.rotation, sh_degree),
+            log_scale: motion.scale.ln() as f32,
             motion,
         }
     }
@@ -99,6 +101,7 @@ impl Carry {
             .motion
             .transform_point(DVec3::from(mean.map(f64::from)));
         *mean = moved.as_vec3().to_array();
+        splats.log_scales[i] = splats.log_scales[i].map(|l| l + self.log_scale);
         let [w, x, y, z] = splats.quats[i].map(f64::from);
         let turned = self.motion.rotation * DQuat::from_xyzw(x, y, z, w);
         splats.quats[i] = [turned.w, turned.x, turned.y, turned.z].map(|v| v as f32);
@@ -154,7 +157,11 @@ mod tests {
     #[test]
     fn a_carried_splat_keeps_its_place_before_the_camera() {
         let (old, new) = (pose(1.0), pose(1.2));
-        let motion = new * old.inverse();
+        let unit = Similarity {
+            scale: 1.5,
+            ..Similarity::IDENTITY
+        };
+        let motion = Similarity::from(new) * unit * old.inverse().into();
         let in_cam = DVec3::new(0.1, 0.2, 2.0);
         let mut splats = Splats {
             means: vec![old.transform_point(in_cam).as_vec3().to_array()],
@@ -169,7 +176,8 @@ mod tests {
         let back = new
             .inverse()
             .transform_point(DVec3::from(splats.means[0].map(f64::from)));
-        assert!((back - in_cam).length() < 1e-5, "{back}");
+        assert!((back - in_cam * 1.5).length() < 1e-5, "{back}");
+        assert!((splats.log_scales[0][2] - 1.5f32.ln()).abs() < 1e-6);
         assert!((f64::from(splats.quats[0][0]) - motion.rotation.w.abs()).abs() < 1e-6);
         assert_eq!(splats.sh[..3], [0.5; 3]);
     }

@@ -101,6 +101,8 @@ impl SplatMap {
         let stats = self.engine.take_stats();
         if stats.n_steps > 0 {
             self.loss_curve.push((self.n_steps, stats.loss));
+            let n_views = self.trainable.len();
+            self.settling.note(stats.loss, stats.n_steps, n_views);
         }
         // A live run has no end: half the points at twice the distance show the same curve.
         if self.loss_curve.len() > MAX_CURVE {

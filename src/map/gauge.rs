@@ -72,7 +72,7 @@ impl SplatMap {
         if drift > MIN_DRIFT && back.is_finite() {
             self.engine.move_cameras(&back);
             let mut splats = self.engine.splats();
-            let carry = Carry::new(back, splats.sh_degree);
+            let carry = Carry::new(back.into(), splats.sh_degree);
             (0..splats.len()).for_each(|i| carry.carry(&mut splats, i));
             self.engine.overwrite(&splats);
         }

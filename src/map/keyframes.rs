@@ -108,8 +108,6 @@ pub fn picture(keyframe: &Keyframe, view: &View, max_side: u32) -> (Arc<RgbImage
 /// The same depth in another unit.
 pub fn rescaled(depth: &DepthMap, factor: f64) -> DepthMap {
     let mut depth = depth.clone();
-    for value in &mut depth.depth {
-        *value = (f64::from(*value) * factor) as f32;
-    }
+    depth.scale(factor);
     depth
 }

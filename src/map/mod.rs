@@ -5,6 +5,7 @@
 
 pub mod align;
 pub mod checkpoint;
+pub mod correction;
 mod depth_scale;
 pub mod figures;
 mod framing;
@@ -26,6 +27,8 @@ mod saving;
 pub mod schedule;
 mod sections;
 pub mod seed;
+mod settle;
+pub mod slew;
 pub mod snapshot;
 pub mod spill;
 mod transient;
@@ -41,6 +44,7 @@ use crate::config::MapParams;
 use crate::config::scale::ScaleParams;
 use crate::frame::Batch;
 use crate::geometry::{GeometryBatch, PoseError, View};
+use crate::map::correction::Correction;
 use crate::map::figures::Peaks;
 use crate::map::gauge::{GAUGE_EVERY, Gauge};
 use crate::map::ids::SplatIds;
@@ -49,6 +53,7 @@ use crate::map::past::Past;
 use crate::map::regions::Regions;
 use crate::map::resting::{Disk, Home, TURN_EVERY};
 use crate::map::schedule::{Phase, Schedule};
+use crate::map::settle::Settling;
 use crate::map::snapshot::{KeyframePose, Scale, Snapshot};
 use crate::splat::{Engine, PoseStep, StepSettings, TrainingView};
 
@@ -80,6 +85,8 @@ pub struct SplatMap {
     /// `None` before views were placed.
     gauge: Option<Gauge>,
     n_put_back: u64,
+    /// Not yet asked for.
+    correction: Option<Correction>,
     /// Share of the input that has come, while more is to come and where it is known.
     progress: Option<f64>,
     scale: Scale,
@@ -100,6 +107,7 @@ pub struct SplatMap {
     loss_curve: Vec<(u64, f64)>,
     /// Steps between points of the curve.
     note_every: u64,
+    settling: Settling,
 }
 
 impl std::fmt::Debug for SplatMap {
@@ -124,6 +132,7 @@ impl SplatMap {
             pose_error: [0.0; 2],
             gauge: None,
             n_put_back: 0,
+            correction: None,
             progress: None,
             scale,
             scale_params: None,
@@ -139,6 +148,7 @@ impl SplatMap {
             peaks: Peaks::default(),
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
+            settling: Settling::default(),
         }
     }
 
@@ -377,6 +387,9 @@ impl SplatMap {
         }
         self.measure_scene();
         self.prune();
+        if !fresh.is_empty() {
+            self.unsettle();
+        }
         self.balance(fresh.len() * self.params.seeds_per_keyframe);
         for id in &fresh {
             self.seed_from(*id, false);

@@ -61,7 +61,7 @@ impl Evicted {
         let bytes = self.slot.read()?;
         let (mut splats, ages) = take_region(&mut &bytes[..]).map_err(io::Error::other)?;
         if let Some(motion) = self.motion {
-            let carry = Carry::new(motion, splats.sh_degree);
+            let carry = Carry::new(motion.into(), splats.sh_degree);
             (0..splats.len()).for_each(|i| carry.carry(&mut splats, i));
         }
         Ok((splats, ages))

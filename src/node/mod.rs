@@ -9,6 +9,7 @@ mod outward;
 pub mod pipeline;
 pub mod ros2;
 pub mod run_dir;
+mod source_stage;
 mod stages;
 mod threads;
 pub mod track_stage;

@@ -2,8 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
-use std::time::Duration;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -18,25 +16,13 @@ use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
 use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
-use crate::source::{Polled, Source, SourceCounts};
 
 /// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
-/// A source that waits for the world is asked so often whether to go on.
-const PATIENCE: Duration = Duration::from_millis(100);
-/// Live: steps that a keyframe is worth; the optimiser rests when all are spent.
-const LIVE_STEPS_PER_KEYFRAME: u64 = 150;
-
-/// Input -> frames.
-pub(super) struct SourceStage {
-    source: Box<dyn Source>,
-    stop: Stop,
-    outbox: Option<Arc<Outbox>>,
-    is_mounted: bool,
-    pub(super) decode_secs: f64,
-}
+/// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
+const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 
 /// Frames -> batches.
 #[derive(Debug)]
@@ -72,70 +58,6 @@ pub(super) struct MapStage {
     pub(super) optimise_secs: f64,
     pub(super) keyframe_to_pose_secs: Vec<f64>,
     pub(super) keyframe_to_snapshot_secs: Vec<f64>,
-}
-
-impl SourceStage {
-    pub(super) fn new(source: Box<dyn Source>, stop: Stop, outbox: Option<Arc<Outbox>>) -> Self {
-        Self {
-            source,
-            stop,
-            outbox,
-            is_mounted: false,
-            decode_secs: 0.0,
-        }
-    }
-
-    /// While paused, frames come and go.
-    pub(super) fn next(&mut self) -> Option<Frame> {
-        while !self.stop.is_asked() {
-            let watch = Stopwatch::start();
-            let polled = self.source.poll(PATIENCE);
-            if !matches!(polled, Polled::Waiting) {
-                self.decode_secs += watch.secs();
-            }
-            let Some(outbox) = self.outbox.as_ref() else {
-                match polled {
-                    Polled::Frame(frame) => return Some(*frame),
-                    Polled::Ended => return None,
-                    Polled::Waiting => continue,
-                }
-            };
-            let warnings = self.source.warnings();
-            outbox.note(|standing| standing.source_notes = warnings);
-            if let Polled::Frame(frame) = &polled {
-                if !self.is_mounted {
-                    let mount = self.source.mount();
-                    outbox.meet_camera(mount, self.source.camera_frame());
-                    self.is_mounted = mount.is_some();
-                }
-                outbox.note_picture(self.source.counts(), frame.intrinsics.is_some());
-            }
-            let switches = outbox.switches();
-            if switches.wants_reset.swap(false, Ordering::Relaxed) {
-                self.stop.ask_restart();
-                return None;
-            }
-            let is_paused = switches.is_paused.load(Ordering::Relaxed);
-            outbox.note(|standing| standing.is_paused = is_paused);
-            match polled {
-                Polled::Frame(frame) if !is_paused => return Some(*frame),
-                Polled::Frame(_) | Polled::Waiting => {}
-                Polled::Ended => {
-                    outbox.note(|standing| standing.has_ended = true);
-                    return None;
-                }
-            }
-        }
-        None
-    }
-
-    pub(super) fn into_source(self) -> Box<dyn Source> {
-        self.source
-    }
-
-    pub(super) fn counts(&self) -> SourceCounts {
-        self.source.counts()
-    }
 }
 
 impl SelectStage {
@@ -281,6 +203,9 @@ impl MapStage {
         &mut self,
         publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
     ) -> bool {
+        if self.map.is_settled() {
+            return false;
+        }
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
         let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
@@ -373,6 +298,9 @@ impl MapStage {
 
     fn snapshot(&mut self) -> Arc<Snapshot> {
         self.note();
+        if let (Some(moved), Some(outbox)) = (self.map.take_correction(), &self.outbox) {
+            outbox.note_move(moved.reason);
+        }
         let snapshot = self.map.snapshot();
         self.since_snapshot = Stopwatch::start();
         for pose in &snapshot.poses {

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::map::align;
+use crate::map::correction::Reason;
 use crate::map::snapshot::Snapshot;
 use crate::pose::{Rigid, Similarity};
 use crate::publish::face::{Delivery, Topic};
@@ -58,7 +59,12 @@ impl MapMove {
 }
 
 /// `None` where both are of one epoch.
-pub fn correction(old: &Snapshot, new: &Snapshot, frame: &str) -> Option<MapCorrection> {
+pub fn correction(
+    old: &Snapshot,
+    new: &Snapshot,
+    why: Option<Reason>,
+    frame: &str,
+) -> Option<MapCorrection> {
     let is_other = old.map_id != new.map_id;
     if !is_other && old.epoch == new.epoch {
         return None;
@@ -73,7 +79,7 @@ pub fn correction(old: &Snapshot, new: &Snapshot, frame: &str) -> Option<MapCorr
         .iter()
         .filter_map(|pose| Some((pose.map_from_cam, *olds.get(&pose.keyframe_id)?)))
         .collect();
-    let is_merged = new.poses.len() > old.poses.len() + pairs.len() / 2;
+    let is_merged = why == Some(Reason::Merge);
     let (found, why) = match align::align(&pairs) {
         Some(similarity) if !is_other && is_merged => (similarity, MapMove::Merge),
         Some(similarity) if !is_other => (similarity, MapMove::Loop),

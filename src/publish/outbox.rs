@@ -5,6 +5,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::PublishParams;
+use crate::map::correction::Reason;
+use crate::map::slew::Slew;
 use crate::map::snapshot::Snapshot;
 use crate::memory::rss_mib;
 use crate::pose::Rigid;
@@ -46,7 +48,6 @@ const MAX_REPEAT_SECS: f64 = 1.0;
 #[derive(Debug)]
 struct Newest {
     at: Whereabouts,
-    map_from_odom: Rigid,
     since: Stopwatch,
 }
 
@@ -62,7 +63,26 @@ struct MapSide {
 #[derive(Debug)]
 struct LiveSide {
     walker: Walker,
+    slew: Slew,
     newest: Option<Newest>,
+}
+
+impl LiveSide {
+    /// `map_from_odom` as navigation is to see it.
+    fn slewed(&mut self, at: &Whereabouts, stamp: Stamp) -> Rigid {
+        let robot = at.odom_from_base.translation;
+        let slewed = self.slew.follow(&at.map_from_odom(), robot, stamp);
+        slewed.map_from_odom
+    }
+}
+
+/// No limit where corrections are to show at once.
+fn slew_of(params: &PublishParams) -> Slew {
+    if params.slew_speed > 0.0 {
+        Slew::new(params.slew_speed, params.slew_turn_deg.to_radians())
+    } else {
+        Slew::new(0.0, 0.0)
+    }
 }
 
 /// The node's way out. Its parts are locked one by one: a slow peer of the map holds up no pose.
@@ -79,6 +99,8 @@ pub struct Outbox {
     live_side: Mutex<LiveSide>,
     standing: Mutex<Standing>,
     since_picture: Mutex<Stopwatch>,
+    /// Why the map has moved since the last correction that went out.
+    moved: Mutex<Option<Reason>>,
     camera_frame: Mutex<String>,
 }
 
@@ -139,10 +161,12 @@ impl Outbox {
             map_side: Mutex::default(),
             live_side: Mutex::new(LiveSide {
                 walker: Walker::new(mount),
+                slew: slew_of(params),
                 newest: None,
             }),
             standing: Mutex::default(),
             since_picture: Mutex::new(Stopwatch::start()),
+            moved: Mutex::default(),
             camera_frame: Mutex::new(params.camera_frame.clone()),
         })
     }
@@ -178,6 +202,11 @@ impl Outbox {
             .iter()
             .flat_map(|face| face.endpoints())
             .collect()
+    }
+
+    /// Why the map of the next snapshots has moved.
+    pub fn note_move(&self, reason: Reason) {
+        *lock(&self.moved) = Some(reason);
     }
 
     /// Each stage writes its own part.
@@ -237,10 +266,10 @@ impl Outbox {
             standing.n_splats = snapshot.splats.len() as u64;
         });
         let mut side = lock(&self.map_side);
-        let moved = side
-            .last
-            .as_ref()
-            .and_then(|last| correction(last, snapshot, self.archive.splat_frame()));
+        let moved = side.last.as_ref().and_then(|last| {
+            let why = lock(&self.moved).take();
+            correction(last, snapshot, why, self.archive.splat_frame())
+        });
         side.last = Some(Arc::clone(snapshot));
         let is_due = side
             .since_whole
@@ -308,7 +337,7 @@ impl Outbox {
         let Some(at) = at else {
             return Ok(());
         };
-        let map_from_odom = at.map_from_odom();
+        let map_from_odom = side.slewed(&at, at.stamp);
         self.send(&self.messages.pose(&at)?)?;
         self.send(&self.messages.odometry(&at)?)?;
         let transforms = self
@@ -316,7 +345,6 @@ impl Outbox {
             .transforms(&map_from_odom, &at, at.stamp, &world)?;
         side.newest = Some(Newest {
             at,
-            map_from_odom,
             since: Stopwatch::start(),
         });
         transforms.map_or(Ok(()), |post| self.send(&post))
@@ -324,20 +352,21 @@ impl Outbox {
 
     /// Between frames: the newest transforms once more, so that nobody has to look back further than they like.
     pub fn repeat_transforms(&self) -> Result<(), PublishError> {
-        let side = lock(&self.live_side);
-        let Some(newest) = &side.newest else {
+        let mut side = lock(&self.live_side);
+        let Some((at, since)) = side.newest.as_ref().map(|newest| (newest.at, newest.since)) else {
             return Ok(());
         };
-        let secs = newest.since.secs();
+        let secs = since.secs();
         if secs > MAX_REPEAT_SECS {
             return Ok(());
         }
-        let nanos = newest.at.stamp.nanos.saturating_add((secs * 1e9) as i64);
+        let nanos = at.stamp.nanos.saturating_add((secs * 1e9) as i64);
         let world = lock(&self.world).clone();
         let stamp = Stamp::from_nanos(nanos);
+        let map_from_odom = side.slewed(&at, stamp);
         let post = self
             .messages
-            .transforms(&newest.map_from_odom, &newest.at, stamp, &world)?;
+            .transforms(&map_from_odom, &at, stamp, &world)?;
         drop(side);
         post.map_or(Ok(()), |post| self.send(&post))
     }

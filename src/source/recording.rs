@@ -95,7 +95,7 @@ struct Written {
 /// What is recorded.
 pub enum Input {
     /// As it comes, with its calibration.
-    Camera(Box<Live>, Option<CameraInfo>),
+    Camera(Box<Live>, Option<Box<CameraInfo>>),
     Frames(Box<dyn Source>),
 }
 
@@ -156,7 +156,7 @@ pub fn record_from(
     };
     match input {
         Input::Camera(live, info) => {
-            from_camera(*live, info.as_ref(), &pictures, &mut progress, &mut tell);
+            from_camera(*live, info.as_deref(), &pictures, &mut progress, &mut tell);
         }
         Input::Frames(source) => {
             let duration = wanted.duration_secs.unwrap_or(f64::INFINITY);
@@ -203,7 +203,7 @@ fn open(
     if let Some(secs) = wanted.duration_secs {
         live.end_after(secs);
     }
-    Ok(Input::Camera(Box::new(live), info))
+    Ok(Input::Camera(Box::new(live), info.map(Box::new)))
 }
 
 fn from_camera(

@@ -231,12 +231,23 @@ pub fn room(n_frames: u32) -> Vec<RgbImage> {
 
 #[test]
 fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
-    let pictures = room(16);
+    let pictures = room(12);
     let map = |unplugged| {
         let size = layout(PixelFormat::Rgb, (192, 144));
         let script = Script::new(size, Clock::Nanos(0), steps_of(&pictures, unplugged));
         let mut settings = Settings::shipped();
-        for setting in ["sequential=true", "map.steps=10", "source.max_frames=16"] {
+        // Small and quick: what matters is whether both runs agree.
+        for setting in [
+            "sequential=true",
+            "map.steps=10",
+            "source.max_frames=12",
+            "backend=cpu",
+            "mvs.backend=cpu",
+            "mvs.max_side=96",
+            "mvs.n_depths=32",
+            "sfm.max_features=600",
+            "track.enabled=false",
+        ] {
             settings.merge_setting(setting).unwrap();
         }
         let params = settings.params().unwrap();
@@ -258,7 +269,7 @@ fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
         (outcome.counts.interruptions, stamps, outcome.snapshot)
     };
     let (none, expected_stamps, expected) = map(None);
-    let (one, stamps, found) = map(Some(9));
+    let (one, stamps, found) = map(Some(7));
     assert_eq!((none, one), (0, 1));
     assert!(
         expected_stamps.len() > 3,

@@ -42,7 +42,7 @@ impl Engine for Pushed {
         if let Some(wander) = self.wander {
             self.inner.move_cameras(&wander);
             let mut splats = self.inner.splats();
-            let carry = Carry::new(wander, splats.sh_degree);
+            let carry = Carry::new(wander.into(), splats.sh_degree);
             (0..splats.len()).for_each(|i| carry.carry(&mut splats, i));
             self.inner.overwrite(&splats);
         }

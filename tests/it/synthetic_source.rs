@@ -118,7 +118,7 @@ fn the_source_straightens_lenses_when_asked() {
 #[test]
 fn a_wrong_scene_or_option_is_refused_with_what_would_be_right() {
     for (text, hint) in [
-        ("rooom", "room, facade or corridor"),
+        ("rooom", "room, facade, corridor or hallway"),
         ("room?frame=3", "frames, width"),
         ("room?frames=0", "[1, 100000]"),
         ("room?frames=1e99", "[1, 100000]"),

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
+use super::loops::{Kept, MIN_GAP};
 use super::{Matched, Pair, Shot, depth_at};
 use crate::config::SfmParams;
 use crate::config::align::AlignParams;
@@ -55,6 +56,7 @@ pub struct Matcher {
 struct Held {
     features: Features,
     comparable: Comparable,
+    signature: Comparable,
     size: (u32, u32),
 }
 
@@ -91,20 +93,57 @@ impl Matcher {
 
     /// The same of many views that were looked at before: what was matched among them then, and pairs that see the
     /// same surface.
-    pub fn matched_anew(&mut self, views: &[View], max_matches: usize) -> Matched {
+    pub fn matched_anew(&mut self, views: &[View], params: &AlignParams) -> Matched {
         let ix_of: BTreeMap<u32, usize> = views
             .iter()
             .enumerate()
             .map(|(ix, v)| (v.keyframe_id, ix))
             .collect();
         let mut chosen = covisible(views);
+        if !params.loops {
+            let id = |ix: usize| views[ix].keyframe_id;
+            chosen.retain(|&(a, b)| id(a).abs_diff(id(b)) <= MIN_GAP);
+        }
         chosen.extend(self.pairs.keys().filter_map(|(a, b)| {
             let (a, b) = (*ix_of.get(a)?, *ix_of.get(b)?);
             Some((a.min(b), a.max(b)))
         }));
         chosen.sort_unstable();
         chosen.dedup();
-        self.matched_pairs(views, &chosen, max_matches)
+        self.matched_pairs(views, &chosen, params.max_matches)
+    }
+
+    /// The same without looking for new pairs.
+    pub(super) fn matched_known(&self, views: &[View]) -> Matched {
+        let ids = views.iter().enumerate();
+        let ix_of: BTreeMap<u32, usize> = ids.map(|(ix, v)| (v.keyframe_id, ix)).collect();
+        let pair = |(ends, features): (&(u32, u32), &Numbers)| {
+            let (first, second) = (*ix_of.get(&ends.0)?, *ix_of.get(&ends.1)?);
+            (first < second && !features.is_empty()).then(|| Pair {
+                first,
+                second,
+                features: features.clone(),
+            })
+        };
+        Matched {
+            pairs: self.pairs.iter().filter_map(pair).collect(),
+            shots: views.iter().map(|view| self.shot(view)).collect(),
+        }
+    }
+
+    /// Keeps what two views that see the same place have in common.
+    pub(super) fn remember(&mut self, (older, newer): (u32, u32), kept: &Kept, max: usize) {
+        if let (Some(a), Some(b)) = (kept.get(&older), kept.get(&newer)) {
+            let found = self.verified([&a.0, &b.0], max);
+            self.pairs.insert((older, newer), found);
+        }
+    }
+
+    /// How many of the coarsest features of two keyframes match.
+    pub(super) fn votes(&self, a: u32, b: u32) -> usize {
+        let signature = |id: &u32| self.held.get(id).map(|held| &held.signature);
+        let both = signature(&a).zip(signature(&b));
+        both.map_or(0, |(a, b)| matches(a, b).len())
     }
 
     fn matched_pairs(
@@ -155,6 +194,7 @@ impl Matcher {
             let features = self.finder.features(&picture, self.max_features);
             let held = Held {
                 comparable: Comparable::new(&features.descriptors),
+                signature: Comparable::new(&features.signature()),
                 features,
                 size: (picture.width as u32, picture.height as u32),
             };
@@ -173,7 +213,7 @@ impl Matcher {
         }
     }
 
-    fn shot(&self, view: &View) -> Shot {
+    pub(super) fn shot(&self, view: &View) -> Shot {
         let i = &view.intrinsics;
         let held = self.held.get(&view.keyframe_id);
         let size = held.map_or_else(
@@ -196,7 +236,7 @@ impl Matcher {
     }
 
     /// Matches of two views, the one with the lower id first, that agree with one rigid scene.
-    fn verified(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
+    pub(super) fn verified(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
         let (Some(first), Some(second)) =
             (self.held.get(&a.keyframe_id), self.held.get(&b.keyframe_id))
         else {

@@ -5,9 +5,12 @@
 
 mod agreeing;
 pub mod bundle_state;
+mod closing;
 pub mod depth_bundle;
 pub mod epipolar;
 mod line_distance;
+mod link;
+mod loops;
 pub mod matches;
 pub mod noise;
 mod overlap;
@@ -174,14 +177,19 @@ impl Aligner {
         }
         self.whole
             .add(fresh, &self.matcher, given, self.params.whole);
-        if !self.whole.is_due(component) {
-            return;
+        let ids: Vec<u32> = fresh.iter().map(|v| v.keyframe_id).collect();
+        let mut correction = None;
+        if self.params.loops {
+            let (whole, matcher) = (&mut self.whole, &mut self.matcher);
+            correction = whole.close_loop(&ids, matcher, &self.params);
         }
-        if let Some(correction) = self
-            .whole
-            .correct(component, &mut self.matcher, &self.params)
-        {
+        if correction.is_none() && self.whole.is_due(component) {
+            let (whole, matcher) = (&mut self.whole, &mut self.matcher);
+            correction = whole.correct(component, matcher, &self.params);
+        }
+        if let Some(correction) = correction {
             self.windows.revise(&correction, joined);
+            joined.is_loop = correction.is_loop;
             joined.revised = correction.revised;
         }
     }

@@ -4,10 +4,11 @@
 //! Windows are corrected with a few neighbours held, so that small errors add up along the way. This keeps of each
 //! keyframe its features, their depth and its pose, and adjusts them all (`geometry::bundle`) now and then.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::agreeing::{Agreeing, agreeing};
 use super::bundle_state::Depths;
+use super::loops::{Kept, Loops};
 use super::matches::Matcher;
 use super::tracks::{Track, covering_tracks, points};
 use super::{Given, MAX_POINT_ERROR_PX, Matched, longest_px, rescale, unit};
@@ -20,7 +21,7 @@ use crate::pose::Rigid;
 /// Side of the grid of depths that is kept of a view.
 const GRID: usize = 24;
 /// Points that each view should have.
-const TRACKS_PER_VIEW: usize = 200;
+pub(super) const TRACKS_PER_VIEW: usize = 200;
 /// Sights below which a view moves as its neighbour does.
 const MIN_SIGHTS: usize = 12;
 /// Views below which windows say all there is.
@@ -43,10 +44,13 @@ const HELD_SHARE: usize = 8;
 #[derive(Debug, Clone, Default)]
 pub(super) struct Whole {
     /// With a grid of depths each, and the depth of each feature.
-    views: BTreeMap<u32, (View, Vec<Option<f64>>)>,
+    pub(super) views: Kept,
     /// By component: keyframes that came so far, and those that had come before the last correction.
-    n_added: BTreeMap<u32, usize>,
-    n_corrected: BTreeMap<u32, usize>,
+    pub(super) n_added: BTreeMap<u32, usize>,
+    pub(super) n_corrected: BTreeMap<u32, usize>,
+    pub(super) loops: Loops,
+    /// Ends of links that hold.
+    pub(super) closed: BTreeSet<(u32, u32)>,
     /// Component of which keyframes were forgotten.
     cut: Option<u32>,
     is_uncalibrated: bool,
@@ -57,8 +61,10 @@ pub(super) struct Whole {
 pub(super) struct Correction {
     /// Every keyframe of the component.
     pub(super) revised: Vec<Revision>,
-    /// Factor on a keyframe's depth.
-    pub(super) depth_factors: BTreeMap<u32, f64>,
+    /// A component that is gone, and the one that its keyframes belong to since.
+    pub(super) merged: Option<(u32, u32)>,
+    /// A place was seen again.
+    pub(super) is_loop: bool,
 }
 
 impl Whole {
@@ -76,6 +82,10 @@ impl Whole {
         self.is_uncalibrated |= !given.is_calibrated;
         while self.views.len() > max {
             self.cut = self.views.pop_first().map(|(_, (view, _))| view.component);
+        }
+        if let Some((oldest, _)) = self.views.first_key_value() {
+            self.loops.forget_before(*oldest);
+            self.closed.retain(|(older, _)| older >= oldest);
         }
     }
 
@@ -112,19 +122,14 @@ impl Whole {
         if views.len() < MIN_VIEWS {
             return None;
         }
-        let is_cut = self.cut == Some(component);
         let given = Given {
-            n_held: if is_cut { views.len() / HELD_SHARE } else { 0 },
+            n_held: self.n_held(component, views.len()),
             is_calibrated: !self.is_uncalibrated,
         };
-        let mut matched = matcher.matched_anew(&views, params.max_matches);
+        let mut matched = matcher.matched_anew(&views, params);
         let tracks = covering_tracks(&matched, TRACKS_PER_VIEW);
         let limit = MAX_POINT_ERROR_PX * longest_px(&matched) / 640.0;
-        let score = |matched: &Matched| {
-            let found = agreeing(matched, &tracks, &depths, (limit, params.depth_error));
-            found.iter().map(|a| a.score).sum::<f64>()
-        };
-        let before = score(&matched);
+        let before = score(&matched, &tracks, &depths, params.depth_error);
         adjust_all(
             &views,
             &mut matched,
@@ -132,7 +137,7 @@ impl Whole {
             params.depth_error,
             given,
         );
-        let after = score(&matched);
+        let after = score(&matched, &tracks, &depths, params.depth_error);
         tracing::debug!(
             component,
             n = views.len(),
@@ -149,17 +154,20 @@ impl Whole {
         let factors = rescale::depth(&mut views, &matched, &points, given.n_held);
         let mut correction = Correction::default();
         for ((view, factor), mut depths) in views.into_iter().zip(factors).zip(depths) {
-            correction.revised.push(Revision {
-                keyframe_id: view.keyframe_id,
-                component,
-                intrinsics: view.intrinsics,
-                batch_from_cam: view.batch_from_cam,
-            });
-            correction.depth_factors.insert(view.keyframe_id, factor);
+            correction.revised.push(revision(&view, factor));
             depths.iter_mut().flatten().for_each(|d| *d *= factor);
             self.views.insert(view.keyframe_id, (view, depths));
         }
         Some(correction)
+    }
+
+    /// Where keyframes had to be forgotten, the oldest of the `n` left stay where they are.
+    pub(super) fn n_held(&self, component: u32, n: usize) -> usize {
+        if self.cut == Some(component) {
+            n / HELD_SHARE
+        } else {
+            0
+        }
     }
 
     fn n_of(&self, component: u32) -> usize {
@@ -175,6 +183,23 @@ impl Whole {
         let count = |counts: &BTreeMap<u32, usize>| counts.get(&component).copied().unwrap_or(0);
         count(&self.n_added) - count(&self.n_corrected)
     }
+}
+
+pub(super) fn revision(view: &View, depth_factor: f64) -> Revision {
+    Revision {
+        keyframe_id: view.keyframe_id,
+        component: view.component,
+        intrinsics: view.intrinsics,
+        batch_from_cam: view.batch_from_cam,
+        depth_factor,
+    }
+}
+
+/// How well the sights of all tracks agree.
+pub(super) fn score(matched: &Matched, tracks: &[Track], depths: &Depths, depth_error: f64) -> f64 {
+    let limit = MAX_POINT_ERROR_PX * longest_px(matched) / 640.0;
+    let found = agreeing(matched, tracks, depths, (limit, depth_error));
+    found.iter().map(|a| a.score).sum()
 }
 
 /// Bundle adjustment of all views over the sights that agree with the poses so far, again and again.

@@ -60,6 +60,8 @@ pub struct Joined {
     pub refined: Refined,
     /// Every keyframe of the component, where all of it was corrected.
     pub revised: Vec<Revision>,
+    /// A place was seen again, and `revised` closes the loop.
+    pub is_loop: bool,
 }
 
 impl Joined {
@@ -138,10 +140,16 @@ impl Windows {
             for view in all.filter(|v| v.keyframe_id == id) {
                 view.batch_from_cam = revision.batch_from_cam;
                 view.intrinsics = revision.intrinsics;
-                let factor = correction.depth_factors.get(&id).copied().unwrap_or(1.0);
-                let values = view.depth.depth.iter_mut();
-                values.for_each(|d| *d = (f64::from(*d) * factor) as f32);
+                view.component = revision.component;
+                view.depth.scale(revision.depth_factor);
             }
+        }
+        if let Some((gone, stays)) = correction.merged
+            && gone == self.component
+        {
+            self.component = stays;
+            let newest = correction.revised.last();
+            self.last_scale *= newest.map_or(1.0, |r| r.depth_factor);
         }
     }
 
@@ -318,8 +326,7 @@ fn transform(view: &mut View, target_from_batch: &Similarity, component: u32) {
         .transform_pose(&view.batch_from_cam)
         .renormalized();
     view.health = view.health.rescaled(target_from_batch.scale);
-    let values = view.depth.depth.iter_mut();
-    values.for_each(|d| *d = (f64::from(*d) * target_from_batch.scale) as f32);
+    view.depth.scale(target_from_batch.scale);
 }
 
 /// The same view with all its lengths times `factor`.

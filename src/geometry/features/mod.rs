@@ -21,6 +21,9 @@ pub const SIFT_LENGTH: f32 = 250.0;
 /// Length of every XFeat descriptor; their products have a sign.
 pub const XFEAT_LENGTH: f32 = 176.0;
 
+/// Descriptors in a signature.
+const SIGNATURE: usize = 192;
+
 /// Of one picture, in the order of its points.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Descriptors {
@@ -57,6 +60,14 @@ pub struct Features {
 }
 
 impl Features {
+    /// The coarsest descriptors of a picture: they survive the largest changes of view.
+    pub fn signature(&self) -> Descriptors {
+        let mut order: Vec<usize> = (0..self.len()).collect();
+        order.sort_by(|&a, &b| self.sigmas[b].total_cmp(&self.sigmas[a]));
+        order.truncate(SIGNATURE);
+        self.descriptors.picked(&order)
+    }
+
     pub fn len(&self) -> usize {
         self.pixels.len()
     }

@@ -231,6 +231,7 @@ impl Foundation {
         views.retain(|view| !self.placed.contains_key(&view.keyframe_id));
         self.placed.extend(told);
         let is_elsewhere = |r: &Revision| views.iter().all(|v| v.keyframe_id != r.keyframe_id);
+        out.is_loop |= joined.is_loop;
         out.revise(joined.revised.into_iter().filter(is_elsewhere));
         out.views.extend(views);
     }

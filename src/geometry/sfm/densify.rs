@@ -64,6 +64,7 @@ impl Densifier {
             batch_id: sparse.batch_id,
             views,
             revised: sparse.revised,
+            is_loop: sparse.is_loop,
             sightings,
             note: sparse.note,
         }

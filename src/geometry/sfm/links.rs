@@ -5,7 +5,6 @@ use rayon::prelude::*;
 
 use super::landmarks::extend;
 use super::scene::{Link, Scene, Shot};
-use crate::geometry::features::Features;
 use crate::geometry::matching::{Comparable, matches};
 use crate::geometry::two_view::{fundamental, motion};
 
@@ -13,8 +12,6 @@ use crate::geometry::two_view::{fundamental, motion};
 const N_RECENT: usize = 6;
 /// Older shots that look alike and are compared, too: jumps and loops need them.
 const N_ALIKE: usize = 4;
-/// Descriptors in a signature.
-const SIGNATURE: usize = 192;
 /// Matching signatures below which two pictures do not look alike.
 const MIN_VOTES: usize = 6;
 /// Older shots asked for likeness; beyond it they are taken evenly.
@@ -23,14 +20,6 @@ const MAX_ASKED: usize = 600;
 const MAX_ANEW: usize = 64;
 /// Verified matches that make a link; fewer are as likely chance.
 const MIN_LINK: usize = 15;
-
-/// The coarsest descriptors of a picture: they survive the largest changes of view.
-pub(super) fn signature(features: &Features) -> Comparable {
-    let mut order: Vec<usize> = (0..features.len()).collect();
-    order.sort_by(|&a, &b| features.sigmas[b].total_cmp(&features.sigmas[a]));
-    order.truncate(SIGNATURE);
-    Comparable::new(&features.descriptors.picked(&order))
-}
 
 /// Links the newest shot (the last) to earlier ones.
 pub(super) fn link_newest(scene: &mut Scene, max_error_px: f64, seed: u64) {
@@ -62,9 +51,16 @@ pub(super) fn link_anew(scene: &mut Scene, max_error_px: f64, seed: u64) {
 
 fn link_back(scene: &mut Scene, shot_ix: usize, max_error_px: f64, seed: u64) {
     let recent = shot_ix.saturating_sub(N_RECENT);
-    let mut others = alike(scene, shot_ix, recent);
-    others.extend(recent..shot_ix);
+    let others: Vec<usize> = (recent..shot_ix).collect();
     link(scene, shot_ix, &others, max_error_px, seed);
+    let others = alike(scene, shot_ix, recent);
+    for (other, found) in found(scene, shot_ix, &others, max_error_px, seed) {
+        if scene.components.is_empty() {
+            insert(scene, shot_ix, other, found);
+        } else {
+            scene.held.insert((other, shot_ix), found);
+        }
+    }
 }
 
 /// Links one shot to those that look alike but were not compared with it, later ones included.
@@ -96,6 +92,38 @@ fn alike(scene: &Scene, shot_ix: usize, pool: usize) -> Vec<usize> {
 }
 
 fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, seed: u64) {
+    for (other, link) in found(scene, shot_ix, others, max_error_px, seed) {
+        insert(scene, shot_ix, other, link);
+    }
+}
+
+/// Takes a held link for one that holds.
+pub(super) fn release(scene: &mut Scene, (older, newer): (usize, usize)) {
+    if let Some(link) = scene.held.remove(&(older, newer)) {
+        insert(scene, newer, older, link);
+    }
+}
+
+/// `link` as (feature of `other`, feature of the shot).
+fn insert(scene: &mut Scene, shot_ix: usize, other: usize, link: Link) {
+    for &(theirs, ours) in &link.matches {
+        scene.shots[other].matched[theirs as usize].push((shot_ix as u32, ours));
+        scene.shots[shot_ix].matched[ours as usize].push((other as u32, theirs));
+    }
+    let flipped = other > shot_ix;
+    let link = if flipped { reversed(&link) } else { link };
+    scene
+        .links
+        .insert((other.min(shot_ix), other.max(shot_ix)), link);
+}
+
+fn found(
+    scene: &Scene,
+    shot_ix: usize,
+    others: &[usize],
+    max_error_px: f64,
+    seed: u64,
+) -> Vec<(usize, Link)> {
     let ours = Comparable::new(&scene.shots[shot_ix].features.descriptors);
     // The first component settles the focal length; from then on the stricter check is possible.
     let focal_known = !scene.components.is_empty();
@@ -111,18 +139,7 @@ fn link(scene: &mut Scene, shot_ix: usize, others: &[usize], max_error_px: f64, 
         );
         link.map(|link| (other, link))
     };
-    let found: Vec<(usize, Link)> = others.par_iter().filter_map(compare).collect();
-    for (other, link) in found {
-        for &(theirs, ours) in &link.matches {
-            scene.shots[other].matched[theirs as usize].push((shot_ix as u32, ours));
-            scene.shots[shot_ix].matched[ours as usize].push((other as u32, theirs));
-        }
-        let flipped = other > shot_ix;
-        let link = if flipped { reversed(&link) } else { link };
-        scene
-            .links
-            .insert((other.min(shot_ix), other.max(shot_ix)), link);
-    }
+    others.par_iter().filter_map(compare).collect()
 }
 
 fn reversed(link: &Link) -> Link {

@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DMat3, DQuat, DVec3};
-use nalgebra::Matrix3;
+use glam::DVec3;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
@@ -12,6 +11,7 @@ use super::adjusting::adjust_global;
 use super::landmarks::join;
 use super::links::pair_seed;
 use super::scene::{NONE, Scene};
+use crate::geometry::umeyama::aligned;
 use crate::pose::Similarity;
 
 const TRIES: usize = 300;
@@ -100,7 +100,7 @@ fn common_landmarks(scene: &Scene, a: u32, b: u32) -> Vec<(u32, u32)> {
 }
 
 /// RANSAC over three landmarks; a pair agrees when each point projects to the sights of its partner.
-fn similarity(
+pub(super) fn similarity(
     scene: &Scene,
     pairs: &[(u32, u32)],
     limits: &Limits,
@@ -153,37 +153,4 @@ fn similarity(
     }
     let enough = best.0.len() >= limits.min_inliers && best.0.len() * 4 >= pairs.len();
     enough.then_some((best.1, best.0))
-}
-
-/// `target_from_source` of (target, source) pairs by least squares (Umeyama 1991).
-pub(super) fn aligned(pairs: &[(DVec3, DVec3)]) -> Option<Similarity> {
-    let n = pairs.len() as f64;
-    if pairs.len() < 3 {
-        return None;
-    }
-    let target_mean = pairs.iter().map(|p| p.0).sum::<DVec3>() / n;
-    let source_mean = pairs.iter().map(|p| p.1).sum::<DVec3>() / n;
-    let mut covariance = Matrix3::<f64>::zeros();
-    let mut variance = 0.0;
-    for (t, s) in pairs {
-        let (t, s) = (*t - target_mean, *s - source_mean);
-        covariance +=
-            nalgebra::Vector3::new(t.x, t.y, t.z) * nalgebra::RowVector3::new(s.x, s.y, s.z) / n;
-        variance += s.length_squared() / n;
-    }
-    let svd = covariance.svd(true, true);
-    let (u, vt) = (svd.u?, svd.v_t?);
-    let mut signs = nalgebra::Vector3::new(1.0, 1.0, 1.0);
-    if u.determinant() * vt.determinant() < 0.0 {
-        signs[svd.singular_values.argmin().0] = -1.0;
-    }
-    let r = u * Matrix3::from_diagonal(&signs) * vt;
-    let scale = svd.singular_values.dot(&signs) / variance;
-    let rotation = DQuat::from_mat3(&DMat3::from_cols_slice(r.as_slice())).normalize();
-    let found = Similarity {
-        scale,
-        rotation,
-        translation: target_mean - rotation * source_mean * scale,
-    };
-    (scale.is_finite() && scale > 1e-6 && found.rotation.is_finite()).then_some(found)
 }

@@ -8,6 +8,7 @@ mod calibrating;
 mod densify;
 mod landmarks;
 mod links;
+mod looping;
 mod merging;
 mod placing;
 pub mod posed;
@@ -27,7 +28,8 @@ pub use report::{NO_PARALLAX, Neighbour, Sighting, SparseBatch, SparseView};
 use self::adjusting::adjust_global;
 use self::calibrating::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use self::densify::Densifier;
-use self::links::{link_alike, link_anew, link_newest, signature};
+use self::links::{link_alike, link_anew, link_newest};
+use self::looping::{release_waiting, settle};
 use self::merging::merge;
 use self::placing::grow;
 use self::report::{Told, note};
@@ -38,6 +40,7 @@ use crate::camera::Intrinsics;
 use crate::config::{MvsParams, OldPoses, SfmParams};
 use crate::frame::{Batch, Keyframe};
 use crate::geometry::features::{Features, Finder, working_picture, working_size};
+use crate::geometry::matching::Comparable;
 use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
 
 /// Size of the picture that `sfm.max_error_px` is meant for.
@@ -72,6 +75,8 @@ pub struct Sfm {
     told: Told,
     batch_id: u32,
     last_start: Option<Start>,
+    /// A loop was closed since the last report.
+    is_loop: bool,
 }
 
 impl Sfm {
@@ -86,6 +91,7 @@ impl Sfm {
             told: Told::default(),
             batch_id: 0,
             last_start: None,
+            is_loop: false,
         })
     }
 
@@ -132,6 +138,7 @@ impl Sfm {
         };
         let mut out = self.told.changes(&self.scene, again);
         out.batch_id = self.batch_id;
+        out.is_loop = std::mem::take(&mut self.is_loop);
         out.note = note(&self.scene, self.last_start);
         out
     }
@@ -218,7 +225,7 @@ impl Sfm {
         let mut shot = Shot {
             keyframe: Arc::clone(keyframe),
             bent_pixels,
-            signature: signature(&found),
+            signature: Comparable::new(&found.signature()),
             lens,
             is_calibrated: known.is_some(),
             placed: None,
@@ -289,6 +296,8 @@ impl Sfm {
 
     fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_shots: usize) {
         grow(&mut self.scene, pool, limits);
+        release_waiting(&mut self.scene);
+        grow(&mut self.scene, pool, limits);
         while let Some(outcome) = self.try_start(pool, min_shots, limits) {
             self.last_start = Some(outcome);
             if outcome != Start::Started {
@@ -302,6 +311,8 @@ impl Sfm {
             }
             grow(&mut self.scene, pool, limits);
         }
+        let max_drift = self.sfm.loops.then_some(self.sfm.max_drift);
+        self.is_loop |= settle(&mut self.scene, limits, max_drift);
         while merge(&mut self.scene, limits) {
             grow(&mut self.scene, pool, limits);
         }

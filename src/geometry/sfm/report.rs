@@ -16,6 +16,10 @@ use crate::pose::Rigid;
 pub const NO_PARALLAX: &str = "no parallax was seen between keyframes";
 /// A pose that moved less needs no telling: 0.05 px at 500 px focal length, and as much of the median depth.
 const MOVED: f64 = 1e-4;
+/// Landmarks of a shot that tell by how much what it sees has grown, at least and at most, and growth that is worth telling.
+const MIN_DEPTHS: usize = 8;
+const MAX_DEPTHS: usize = 64;
+const RESIZED: f64 = 2e-3;
 
 /// A landmark in a view.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +62,8 @@ pub struct SparseBatch {
     pub views: Vec<SparseView>,
     /// Views given earlier that moved, or whose focal length did.
     pub revised: Vec<Revision>,
+    /// As in `GeometryBatch`.
+    pub is_loop: bool,
     pub note: Option<String>,
 }
 
@@ -65,6 +71,8 @@ pub struct SparseBatch {
 #[derive(Debug, Default)]
 pub(super) struct Told {
     cameras: BTreeMap<usize, Revision>,
+    /// Some of the landmarks that each saw then, and their distance along its axis.
+    depths: BTreeMap<usize, Vec<(u32, f64)>>,
 }
 
 impl Told {
@@ -82,19 +90,23 @@ impl Told {
                 component: placed.component,
                 intrinsics,
                 batch_from_cam: placed.cam_from_map.inverse(),
+                depth_factor: self.depth_factor(scene, shot_ix),
             };
             let before = self.cameras.insert(shot_ix, here);
             if before.is_none() || again.contains(&shot_ix) {
                 out.views.extend(view(scene, shot_ix));
+                self.depths.insert(shot_ix, depths(scene, shot_ix));
             }
             if let Some(before) = before {
                 let (old, new) = (before.batch_from_cam, here.batch_from_cam);
                 let moved = before.component != here.component
                     || old.angle_to(&new) > MOVED
                     || old.translation.distance(new.translation) > MOVED
-                    || (before.intrinsics.fx / intrinsics.fx - 1.0).abs() > MOVED;
+                    || (before.intrinsics.fx / intrinsics.fx - 1.0).abs() > MOVED
+                    || (here.depth_factor - 1.0).abs() > RESIZED;
                 if moved {
                     out.revised.push(here);
+                    self.depths.insert(shot_ix, depths(scene, shot_ix));
                 } else {
                     // Small moves add up: compare with what was told.
                     self.cameras.insert(shot_ix, before);
@@ -103,6 +115,55 @@ impl Told {
         }
         out
     }
+}
+
+impl Told {
+    /// How much farther a shot sees the same landmarks than when it was told; 1 where that is within their noise.
+    fn depth_factor(&self, scene: &Scene, shot_ix: usize) -> f64 {
+        let Some(placed) = &scene.shots[shot_ix].placed else {
+            return 1.0;
+        };
+        let told = self.depths.get(&shot_ix).map_or(&[][..], Vec::as_slice);
+        let log = |&(landmark, then): &(u32, f64)| {
+            let landmark = &scene.landmarks[landmark as usize];
+            let is_seen = landmark.seen.iter().any(|at| at.0 as usize == shot_ix);
+            let now = placed.cam_from_map.transform_point(landmark.point).z;
+            (is_seen && now > 0.0 && then > 0.0).then(|| (now / then).ln())
+        };
+        let mut logs: Vec<f64> = told.iter().filter_map(log).collect();
+        let is_enough = logs.len() >= MIN_DEPTHS;
+        let factor = median(&mut logs).filter(|_| is_enough).unwrap_or(0.0).exp();
+        if (factor - 1.0).abs() > RESIZED {
+            factor
+        } else {
+            1.0
+        }
+    }
+}
+
+/// Landmarks of a shot and their distance, evenly picked.
+fn depths(scene: &Scene, shot_ix: usize) -> Vec<(u32, f64)> {
+    let shot = &scene.shots[shot_ix];
+    let Some(placed) = &shot.placed else {
+        return Vec::new();
+    };
+    let seen: Vec<u32> = shot
+        .landmark_of
+        .iter()
+        .copied()
+        .filter(|l| *l != NONE)
+        .collect();
+    let stride = seen.len().div_ceil(MAX_DEPTHS).max(1);
+    let z = |l: u32| {
+        placed
+            .cam_from_map
+            .transform_point(scene.landmarks[l as usize].point)
+            .z
+    };
+    seen.into_iter()
+        .step_by(stride)
+        .map(|l| (l, z(l)))
+        .collect()
 }
 
 /// One sentence on what is missing; `None` when all is placed in one frame.

@@ -92,6 +92,10 @@ pub(super) struct Component {
 pub(super) struct Scene {
     pub(super) shots: Vec<Shot>,
     pub(super) links: BTreeMap<(usize, usize), Link>,
+    /// To shots long before, which may only look alike: not used until they fit or close a loop (`looping`).
+    pub(super) held: BTreeMap<(usize, usize), Link>,
+    /// Ends of links that closed loops.
+    pub(super) closed: Vec<(usize, usize)>,
     pub(super) landmarks: Vec<Landmark>,
     pub(super) components: Vec<Component>,
     /// Of the lens of all uncalibrated shots, as in `bundle::Camera`.

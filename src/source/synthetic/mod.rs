@@ -10,6 +10,7 @@ mod facade;
 mod furniture;
 mod geometry;
 mod glyphs;
+mod hallway;
 mod joinery;
 mod lens;
 mod light;
@@ -43,7 +44,7 @@ use take::Take;
 
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
-    #[error("{found:?} is no synthetic scene, expected room, facade or corridor")]
+    #[error("{found:?} is no synthetic scene, expected room, facade, corridor or hallway")]
     Scene { found: String },
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
@@ -73,6 +74,8 @@ pub enum SceneKind {
     Facade,
     /// Four corridors that close to a loop.
     Corridor,
+    /// A straight hallway of bays that are all alike; no place is seen twice.
+    Hallway,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -181,6 +181,7 @@ impl FromStr for SceneKind {
             "room" => Ok(Self::Room),
             "facade" => Ok(Self::Facade),
             "corridor" => Ok(Self::Corridor),
+            "hallway" => Ok(Self::Hallway),
             _ => Err(SynthError::Scene {
                 found: text.to_owned(),
             }),

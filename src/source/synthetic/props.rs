@@ -13,6 +13,7 @@ pub(super) struct Props {
     pub(super) solids: Vec<Solid>,
     origin: DVec3,
     turn: DMat3,
+    number: u32,
 }
 
 impl Props {
@@ -21,7 +22,18 @@ impl Props {
             solids: Vec::new(),
             origin: DVec3::ZERO,
             turn: DMat3::IDENTITY,
+            number: 1,
         }
+    }
+
+    /// Of the next solid: what is uneven about its paint follows from it.
+    pub(super) fn next_number(&self) -> u32 {
+        self.number
+    }
+
+    /// From here on solids are numbered as if `number` came next: equal numbers look equal.
+    pub(super) fn number_from(&mut self, number: u32) {
+        self.number = number;
     }
 
     /// From here on places are meant from `origin`, turned by `yaw_deg` about z.
@@ -37,7 +49,8 @@ impl Props {
             centre: self.origin + self.turn * centre,
             world_from_local: self.turn * local,
         };
-        let seed = hash(self.solids.len() as u32 + 1);
+        let seed = hash(self.number);
+        self.number += 1;
         self.solids.push(Solid {
             placed,
             paint,

@@ -17,7 +17,9 @@ use crate::pose::Rigid;
 
 use super::geometry::Ray;
 use super::scene::Scene;
-use super::{SceneKind, SynthError, SynthSettings, corridor, facade, noise, room, trajectory};
+use super::{
+    SceneKind, SynthError, SynthSettings, corridor, facade, hallway, noise, room, trajectory,
+};
 
 /// Header stamps start here and go on at 10 Hz.
 const START_SECS: i64 = 1_700_000_000;
@@ -47,12 +49,13 @@ pub struct Take {
 impl Take {
     /// Builds the scene and its light on first use (about a second); later takes share it.
     pub fn new(settings: SynthSettings) -> Result<Self, SynthError> {
-        static SCENES: [OnceLock<Arc<Scene>>; 3] = [const { OnceLock::new() }; 3];
+        static SCENES: [OnceLock<Arc<Scene>>; 4] = [const { OnceLock::new() }; 4];
         settings.check()?;
         let (slot, build): (usize, fn() -> Scene) = match settings.scene {
             SceneKind::Room => (0, room::scene),
             SceneKind::Facade => (1, facade::scene),
             SceneKind::Corridor => (2, corridor::scene),
+            SceneKind::Hallway => (3, hallway::scene),
         };
         let scene = SCENES[slot].get_or_init(|| Arc::new(build())).clone();
         Ok(Self { settings, scene })

@@ -7,6 +7,7 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::pose::Rigid;
 
 use super::SceneKind;
+use super::hallway::{BAY, N_WALKED};
 use super::noise::pick;
 
 /// One round takes this long at speed 1; then it goes on, closed and smooth.
@@ -18,6 +19,7 @@ pub(super) fn world_from_cam(scene: SceneKind, secs: f64, seed: u32) -> Rigid {
         SceneKind::Room => around_the_table(turn),
         SceneKind::Facade => along_the_street(turn),
         SceneKind::Corridor => through_the_corridor(turn),
+        SceneKind::Hallway => along_the_hallway(secs),
     };
     let rotation = looking(target - position) * DQuat::from_scaled_axis(shake(secs, seed, 0.008));
     Rigid::new(
@@ -75,6 +77,14 @@ fn through_the_corridor(turn: f64) -> (DVec3, DVec3) {
     let ahead = place(turn + 0.45) - position;
     let across = DVec3::new(-ahead.y, ahead.x, 0.0);
     (position, position + ahead + across * side - DVec3::Z * 0.1)
+}
+
+/// Straight on, and at rest at the end; the camera looks about as often as bays go by, so that bays look alike, too.
+fn along_the_hallway(secs: f64) -> (DVec3, DVec3) {
+    const METRES_PER_SEC: f64 = 1.1;
+    let position = DVec3::new((METRES_PER_SEC * secs).min(N_WALKED * BAY), 0.0, 1.5);
+    let side = 0.35 * (TAU * position.x / (2.0 * BAY)).sin();
+    (position, position + DVec3::new(1.0, side, -0.08))
 }
 
 /// Camera axes (x right, y down, z forward) for someone who looks along `forward` with a level horizon.

@@ -1,0 +1,214 @@
+//! Links to places seen before -> a component whose way between is bent until both ends meet, or two that become one.
+//!
+//! First a graph of poses spreads what the links ask for over the way, then all is adjusted as a whole. A loop after
+//! which the matches along the way agree less was none: everything is put back.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::link::Link;
+use super::loops::{Kept, correction};
+use super::matches::Matcher;
+use super::tracks::{Track, covering_tracks};
+use super::whole::{Correction, TRACKS_PER_VIEW, Whole, score};
+use crate::config::align::AlignParams;
+use crate::geometry::View;
+use crate::geometry::pose_graph::{Graph, Tie};
+use crate::pose::{Rigid, Similarity};
+
+/// Steps of the graph of poses.
+const MAX_STEPS: usize = 60;
+/// Neighbours that a keyframe is tied to.
+const N_TIED: usize = 2;
+/// Links must fit the graph within so many standard deviations on average.
+const MAX_MISFIT: f64 = 4.0;
+/// Of what matches along the way agreed on before, so much must be left.
+const MIN_LEFT: f64 = 0.9;
+
+impl Whole {
+    /// Looks whether one of the `fresh` keyframes sees a place again, and closes the loop.
+    pub(super) fn close_loop(
+        &mut self,
+        fresh: &[u32],
+        matcher: &mut Matcher,
+        params: &AlignParams,
+    ) -> Option<Correction> {
+        let links = self.loops.found(&self.views, matcher, fresh, params);
+        let (first, last) = (links.first()?, links.last()?);
+        let component = |id: u32| self.views.get(&id).map(|(view, _)| view.component);
+        let sides = [component(first.older)?, component(last.newer)?];
+        let ids: Vec<u32> = self
+            .views
+            .values()
+            .map(|(view, _)| view)
+            .filter(|view| sides.contains(&view.component))
+            .map(|view| view.keyframe_id)
+            .collect();
+        let before = self.views.clone();
+        let way = self.tracks_along(&ids, matcher);
+        let score_before = self.score_of(&ids, &way, matcher, params);
+        let is_bent = self.bend(&ids, &links, sides);
+        if is_bent {
+            links
+                .iter()
+                .for_each(|l| matcher.remember(l.ends(), &self.views, params.max_matches));
+            self.closed.extend(links.iter().map(Link::ends));
+            self.merge_counts(sides);
+            self.correct(sides[0].min(sides[1]), matcher, params);
+        }
+        let score_after = self.score_of(&ids, &way, matcher, params);
+        let is_good = is_bent && score_after >= MIN_LEFT * score_before;
+        tracing::info!(
+            older = first.older,
+            newer = last.newer,
+            n_links = links.len(),
+            ?sides,
+            is_bent,
+            score_before,
+            score_after,
+            "{}",
+            if is_good {
+                "a loop is closed"
+            } else {
+                "a loop is refused"
+            }
+        );
+        if !is_good {
+            self.views = before;
+            self.loops.refuse(&links);
+            return None;
+        }
+        Some(self.news(&ids, &before, sides))
+    }
+
+    /// Tracks of what was matched so far, which knows nothing of the loop.
+    fn tracks_along(&self, ids: &[u32], matcher: &Matcher) -> Vec<Track> {
+        let matched = matcher.matched_known(&self.views_of(ids));
+        covering_tracks(&matched, TRACKS_PER_VIEW)
+    }
+
+    fn score_of(
+        &self,
+        ids: &[u32],
+        tracks: &[Track],
+        matcher: &Matcher,
+        params: &AlignParams,
+    ) -> f64 {
+        let matched = matcher.matched_known(&self.views_of(ids));
+        let depths = ids.iter().map(|id| self.views[id].1.clone()).collect();
+        score(&matched, tracks, &depths, params.depth_error)
+    }
+
+    fn views_of(&self, ids: &[u32]) -> Vec<View> {
+        ids.iter().map(|id| self.views[id].0.clone()).collect()
+    }
+
+    /// Moves all so that the links fit; `false` where they do not even then.
+    fn bend(&mut self, ids: &[u32], links: &[Link], sides: [u32; 2]) -> bool {
+        let Some(mut graph) = self.graph(ids, links, sides) else {
+            return false;
+        };
+        let relaxed = graph.relax(MAX_STEPS);
+        let misfit = graph.mean_misfit();
+        let is_sound = graph.nodes.iter().all(Similarity::is_finite);
+        tracing::debug!(?relaxed, misfit, is_sound, "graph");
+        if misfit.is_nan() || misfit > MAX_MISFIT || !is_sound {
+            return false;
+        }
+        let stays = sides[0].min(sides[1]);
+        for (id, node) in ids.iter().zip(&graph.nodes) {
+            let Some((view, depths)) = self.views.get_mut(id) else {
+                continue;
+            };
+            view.batch_from_cam = Rigid::new(node.rotation, node.translation).renormalized();
+            view.component = stays;
+            view.depth.scale(node.scale);
+            depths.iter_mut().flatten().for_each(|d| *d *= node.scale);
+        }
+        true
+    }
+
+    /// Keyframes as they stand, tied to their neighbours and by the links.
+    fn graph(&self, ids: &[u32], links: &[Link], sides: [u32; 2]) -> Option<Graph> {
+        let ix_of: BTreeMap<u32, usize> =
+            ids.iter().enumerate().map(|(ix, id)| (*id, ix)).collect();
+        let views: Vec<&View> = ids.iter().map(|id| &self.views[id].0).collect();
+        let poses: Vec<Similarity> = views.iter().map(|v| v.batch_from_cam.into()).collect();
+        let mut ties = Vec::new();
+        for side in BTreeSet::from(sides) {
+            let own: Vec<usize> = (0..ids.len())
+                .filter(|&ix| views[ix].component == side)
+                .collect();
+            for (at, &second) in own.iter().enumerate() {
+                let near = own[at.saturating_sub(N_TIED)..at].iter();
+                ties.extend(
+                    near.map(|&first| Tie::as_is(&poses, (first, second), depth(views[second]))),
+                );
+            }
+        }
+        let closed = self.closed.iter().filter_map(|(older, newer)| {
+            let (first, second) = (*ix_of.get(older)?, *ix_of.get(newer)?);
+            Some(Tie::as_is(&poses, (first, second), depth(views[second])))
+        });
+        ties.extend(closed);
+        for link in links {
+            let (first, second) = (*ix_of.get(&link.older)?, *ix_of.get(&link.newer)?);
+            ties.push(Tie::link(
+                link.older_from_newer,
+                (first, second),
+                depth(views[second]),
+            ));
+        }
+        let mut nodes = poses;
+        if sides[0] != sides[1] {
+            let moved = correction(&self.views, links.first()?)?;
+            for (node, view) in nodes.iter_mut().zip(&views) {
+                if view.component == sides[1] {
+                    *node = moved * *node;
+                }
+            }
+        }
+        let n_held = self.n_held(sides[0], ids.len()).max(1);
+        Some(Graph {
+            nodes,
+            is_held: (0..ids.len()).map(|ix| ix < n_held).collect(),
+            ties,
+            moves_scale: true,
+        })
+    }
+
+    /// What both sides counted is one component's.
+    fn merge_counts(&mut self, sides: [u32; 2]) {
+        let (stays, gone) = (sides[0].min(sides[1]), sides[0].max(sides[1]));
+        if stays == gone {
+            return;
+        }
+        let added = self.n_added.remove(&gone).unwrap_or(0);
+        *self.n_added.entry(stays).or_default() += added;
+        self.n_corrected.remove(&gone);
+    }
+
+    /// Every keyframe of the component as it stands, beside what was told before.
+    fn news(&self, ids: &[u32], before: &Kept, sides: [u32; 2]) -> Correction {
+        let revision = |id: &u32| {
+            let ((view, depths), (_, old)) = (&self.views[id], &before[id]);
+            let pairs = depths.iter().flatten().zip(old.iter().flatten());
+            let grid = view.depth.depth.iter().zip(&before[id].0.depth.depth);
+            let grid = grid.filter(|(new, old)| **new > 0.0 && **old > 0.0);
+            let ratio = pairs.map(|(new, old)| new / old).next();
+            let of_grid = grid
+                .map(|(new, old)| f64::from(*new) / f64::from(*old))
+                .next();
+            super::whole::revision(view, ratio.or(of_grid).unwrap_or(1.0))
+        };
+        Correction {
+            revised: ids.iter().map(revision).collect(),
+            merged: (sides[0] != sides[1])
+                .then(|| (sides[0].max(sides[1]), sides[0].min(sides[1]))),
+            is_loop: true,
+        }
+    }
+}
+
+fn depth(view: &View) -> f64 {
+    view.depth.median().map_or(1.0, f64::from)
+}

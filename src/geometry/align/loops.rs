@@ -1,0 +1,329 @@
+//! A new keyframe -> links to places that were seen long before, each checked by pixels, depth and its neighbours.
+//!
+//! Places that look alike are no rarer than places seen again, so a link is believed only if (1) keyframes beside both
+//! ends say the same, (2) no other place fits about as well, poses as they are included, and (3) it asks for no larger a drift than the way between
+//! may have gathered: a corridor of equal doors asks for as much as was walked.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+
+use super::link::{Link, Seen, verified};
+use super::matches::Matcher;
+use crate::config::align::AlignParams;
+use crate::geometry::{View, pose_graph};
+use crate::pose::Similarity;
+
+/// What is remembered of keyframes: with a grid of depths each, and the depth of each feature.
+pub(super) type Kept = BTreeMap<u32, (View, Vec<Option<f64>>)>;
+
+/// Keyframes in between from which on a place is seen again; nearer ones are matched anyway.
+pub(super) const MIN_GAP: u32 = 20;
+/// Matching signatures below which two pictures do not look alike.
+const MIN_VOTES: usize = 6;
+/// Places that a keyframe is compared with, and how many keyframes one place takes.
+const N_PLACES: usize = 8;
+const PLACE: u32 = 3;
+/// Neighbours of both ends that are asked, to each side.
+const N_BESIDE: usize = 2;
+/// Links that must agree: within a component, and between two of which nothing else is known.
+const MIN_LINKS: usize = 2;
+const MIN_LINKS_ACROSS: usize = 4;
+/// What links may differ in: share of the depth, radians, logarithm of scale.
+const SAME_PLACE: f64 = 0.2;
+const SAME_TURN: f64 = 0.07;
+const SAME_SCALE: f64 = 0.15;
+/// Another place that has this share of a link's matches makes it doubtful.
+const RIVAL: f64 = 0.6;
+/// A correction below this is left to the adjustment of all: share of the depth, radians, logarithm of scale.
+const SMALL_SHIFT: f64 = 0.1;
+const SMALL_TURN: f64 = 0.02;
+const SMALL_SCALE: f64 = 0.06;
+/// Of a way's drift: turn in radians, and logarithm of scale.
+const MAX_TURN: f64 = 0.35;
+const MAX_SCALE: f64 = 0.3;
+/// Links that wait for a neighbour's word.
+const MAX_PENDING: usize = 12;
+
+#[derive(Debug, Clone, Default)]
+pub(super) struct Loops {
+    pending: Vec<Link>,
+    /// Pairs that led to nothing good.
+    refused: BTreeSet<(u32, u32)>,
+}
+
+/// Links of a new keyframe, and where they would have the newer end's side of the map.
+struct Best {
+    link: Link,
+    /// `older_side_from_newer_side`, in map coordinates.
+    correction: Similarity,
+}
+
+impl Loops {
+    /// Links that agree, of one of the `fresh` keyframes and those beside it; empty where nothing new was found.
+    pub(super) fn found(
+        &mut self,
+        kept: &Kept,
+        matcher: &Matcher,
+        fresh: &[u32],
+        params: &AlignParams,
+    ) -> Vec<Link> {
+        for &id in fresh {
+            let Some(best) = self.best_link(kept, matcher, id, params) else {
+                continue;
+            };
+            let mut links = confirming(kept, matcher, &best, params);
+            let agreeing = self.pending.iter().filter(|l| agrees(kept, &best, l));
+            links.extend(agreeing.copied());
+            links.push(best.link);
+            links.sort_by_key(Link::ends);
+            links.dedup_by_key(|l| l.ends());
+            if is_enough(kept, &links) {
+                self.pending.clear();
+                return links;
+            }
+            self.pending.push(best.link);
+            if self.pending.len() > MAX_PENDING {
+                self.pending.remove(0);
+            }
+        }
+        Vec::new()
+    }
+
+    /// They did more harm than good.
+    pub(super) fn refuse(&mut self, links: &[Link]) {
+        self.refused.extend(links.iter().map(Link::ends));
+    }
+
+    /// Keyframes before `id` are forgotten.
+    pub(super) fn forget_before(&mut self, id: u32) {
+        self.refused.retain(|(older, _)| *older >= id);
+        self.pending.retain(|l| l.older >= id);
+    }
+
+    /// The place that fits best, if it asks for a correction that may be and no other place fits about as well.
+    fn best_link(
+        &self,
+        kept: &Kept,
+        matcher: &Matcher,
+        id: u32,
+        params: &AlignParams,
+    ) -> Option<Best> {
+        let asked: Vec<u32> = places(kept, matcher, id);
+        let check = |&older: &u32| self.checked(kept, matcher, (older, id), params);
+        let mut found: Vec<Best> = asked.par_iter().filter_map(check).collect();
+        found.sort_by_key(|b| (std::cmp::Reverse(b.link.n), b.link.older));
+        let mut rest = found.into_iter();
+        let best = rest.next()?;
+        // One that no drift explains is a rival all the same: the place looks like others.
+        let rival = rest.find(|b| !is_same(kept, id, &b.correction, &best.correction));
+        let is_rivalled = rival
+            .as_ref()
+            .is_some_and(|r| r.link.n as f64 > RIVAL * best.link.n as f64);
+        let is_plausible = is_plausible(kept, &best, params.max_drift);
+        let needed = is_needed(kept, &best);
+        tracing::debug!(
+            id,
+            older = best.link.older,
+            n = best.link.n,
+            is_rivalled,
+            is_plausible,
+            needed,
+            "seen again"
+        );
+        (!is_rivalled && is_plausible && needed).then_some(best)
+    }
+
+    fn checked(
+        &self,
+        kept: &Kept,
+        matcher: &Matcher,
+        ends: (u32, u32),
+        params: &AlignParams,
+    ) -> Option<Best> {
+        if self.refused.contains(&ends) {
+            return None;
+        }
+        let link = link(kept, matcher, ends, params)?;
+        let correction = correction(kept, &link)?;
+        Some(Best { link, correction })
+    }
+}
+
+fn link(kept: &Kept, matcher: &Matcher, ends: (u32, u32), params: &AlignParams) -> Option<Link> {
+    let (older, newer) = (kept.get(&ends.0)?, kept.get(&ends.1)?);
+    let seen = |(view, depths): &'_ (View, Vec<Option<f64>>)| -> (Vec<DVec2>, Vec<Option<f64>>) {
+        (matcher.shot(view).pixels, depths.clone())
+    };
+    let matches = matcher.verified([&older.0, &newer.0], params.max_matches);
+    if matches.is_empty() {
+        return None;
+    }
+    let ((pixels_a, depths_a), (pixels_b, depths_b)) = (seen(older), seen(newer));
+    let of = |view, pixels, depths| Seen {
+        view,
+        lens: matcher.shot(view).lens,
+        pixels,
+        depths,
+    };
+    let a = of(&older.0, pixels_a, depths_a);
+    let b = of(&newer.0, pixels_b, depths_b);
+    verified(&a, &b, &matches, params.depth_error)
+}
+
+/// Earlier keyframes whose signatures match best, one of each place.
+fn places(kept: &Kept, matcher: &Matcher, id: u32) -> Vec<u32> {
+    let Some((own, _)) = kept.get(&id) else {
+        return Vec::new();
+    };
+    let is_far =
+        |other: &View| other.component != own.component || id > other.keyframe_id + MIN_GAP;
+    let asked: Vec<u32> = kept
+        .values()
+        .map(|(view, _)| view)
+        .filter(|view| view.keyframe_id < id && is_far(view))
+        .map(|view| view.keyframe_id)
+        .collect();
+    let votes = |&other: &u32| (matcher.votes(id, other), other);
+    let mut ranked: Vec<(usize, u32)> = asked.par_iter().map(votes).collect();
+    ranked.retain(|r| r.0 >= MIN_VOTES);
+    ranked.sort_by_key(|r| (std::cmp::Reverse(r.0), r.1));
+    let mut picked: Vec<u32> = Vec::new();
+    for (_, other) in ranked {
+        if picked.iter().all(|p| p.abs_diff(other) >= PLACE) {
+            picked.push(other);
+        }
+        if picked.len() == N_PLACES {
+            break;
+        }
+    }
+    picked
+}
+
+/// Links between the neighbours of both ends that say the same; none where more say otherwise.
+fn confirming(kept: &Kept, matcher: &Matcher, best: &Best, params: &AlignParams) -> Vec<Link> {
+    let beside = |id: u32, forward: usize| -> Vec<u32> {
+        let Some((own, _)) = kept.get(&id) else {
+            return Vec::new();
+        };
+        let is_own = |k: &&u32| kept[k].0.component == own.component;
+        let before = kept.range(..id).rev().map(|(k, _)| k);
+        let behind = kept.range(id + 1..).map(|(k, _)| k);
+        let before = before.filter(is_own).take(N_BESIDE);
+        let behind = behind.filter(is_own).take(forward);
+        before.chain(behind).copied().chain([id]).collect()
+    };
+    let newer_ends = beside(best.link.newer, 0);
+    let mut pairs = Vec::new();
+    for older in beside(best.link.older, N_BESIDE) {
+        pairs.extend(newer_ends.iter().map(|&newer| (older, newer)));
+    }
+    pairs.retain(|&(older, newer)| older < newer && (older, newer) != best.link.ends());
+    let found: Vec<Link> = pairs
+        .par_iter()
+        .filter_map(|&ends| link(kept, matcher, ends, params))
+        .collect();
+    let n = found.len();
+    let agreeing: Vec<Link> = found
+        .into_iter()
+        .filter(|l| agrees(kept, best, l))
+        .collect();
+    if 2 * agreeing.len() > n {
+        agreeing
+    } else {
+        Vec::new()
+    }
+}
+
+/// Enough of them, and not all from one keyframe.
+fn is_enough(kept: &Kept, links: &[Link]) -> bool {
+    let olders: BTreeSet<u32> = links.iter().map(|l| l.older).collect();
+    let newers: BTreeSet<u32> = links.iter().map(|l| l.newer).collect();
+    let is_across = links
+        .iter()
+        .any(|l| component(kept, l.older) != component(kept, l.newer));
+    let needed = if is_across {
+        MIN_LINKS_ACROSS
+    } else {
+        MIN_LINKS
+    };
+    links.len() >= needed && olders.len() >= 2 && newers.len() >= 2
+}
+
+fn component(kept: &Kept, id: u32) -> Option<u32> {
+    kept.get(&id).map(|(view, _)| view.component)
+}
+
+fn map_from_cam(kept: &Kept, id: u32) -> Option<Similarity> {
+    Some(kept.get(&id)?.0.batch_from_cam.into())
+}
+
+/// What the link would do to the newer end's side of the map.
+pub(super) fn correction(kept: &Kept, link: &Link) -> Option<Similarity> {
+    let older = map_from_cam(kept, link.older)?;
+    let newer = map_from_cam(kept, link.newer)?;
+    Some(older * link.older_from_newer * newer.inverse())
+}
+
+fn agrees(kept: &Kept, best: &Best, link: &Link) -> bool {
+    let is_between = component(kept, link.older) == component(kept, best.link.older)
+        && component(kept, link.newer) == component(kept, best.link.newer);
+    let theirs = correction(kept, link);
+    is_between && theirs.is_some_and(|c| is_same(kept, best.link.newer, &c, &best.correction))
+}
+
+fn apart(kept: &Kept, id: u32, a: &Similarity, b: &Similarity) -> Option<[f64; 3]> {
+    let (view, _) = kept.get(&id)?;
+    let depth = f64::from(view.depth.median()?);
+    Some(pose_graph::apart(
+        view.batch_from_cam.translation,
+        depth,
+        a,
+        b,
+    ))
+}
+
+fn is_same(kept: &Kept, id: u32, a: &Similarity, b: &Similarity) -> bool {
+    apart(kept, id, a, b).is_some_and(|[shift, turn, scale]| {
+        shift <= SAME_PLACE && turn <= SAME_TURN && scale <= SAME_SCALE
+    })
+}
+
+/// Between two components any, else one that the poses do not have already.
+fn is_needed(kept: &Kept, best: &Best) -> bool {
+    if component(kept, best.link.older) != component(kept, best.link.newer) {
+        return true;
+    }
+    apart(
+        kept,
+        best.link.newer,
+        &best.correction,
+        &Similarity::IDENTITY,
+    )
+    .is_some_and(|[shift, turn, scale]| {
+        shift > SMALL_SHIFT || turn > SMALL_TURN || scale > SMALL_SCALE
+    })
+}
+
+/// Whether the way between both ends may have gathered so much drift.
+fn is_plausible(kept: &Kept, best: &Best, max_drift: f64) -> bool {
+    let (older, newer) = best.link.ends();
+    if component(kept, older) != component(kept, newer) {
+        return true;
+    }
+    let own = component(kept, newer);
+    let mut length = 0.0;
+    let mut last: Option<DVec3> = None;
+    for (view, _) in kept.range(older..=newer).map(|(_, k)| k) {
+        if Some(view.component) == own {
+            let centre = view.batch_from_cam.translation;
+            length += last.map_or(0.0, |l| l.distance(centre));
+            last = Some(centre);
+        }
+    }
+    let Some(centre) = last else { return false };
+    let shift = best.correction.transform_point(centre).distance(centre);
+    let turn = best.correction.angle();
+    shift <= max_drift * length && turn <= MAX_TURN && best.correction.scale.ln().abs() <= MAX_SCALE
+}

@@ -1,0 +1,356 @@
+//! Links to shots long before -> used where they fit, a loop that is closed where they agree on one, else dropped.
+//!
+//! The gates are those of `align::loops`: neighbours say the same, no other place fits as well, and the way between may
+//! have drifted so far. A closed loop bends the way by a graph of poses, joins landmarks and adjusts all; if that loses
+//! sights, it was none and all is put back.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::DVec3;
+
+use super::Limits;
+use super::adjusting::{adjust_global, adjust_local};
+use super::landmarks::{extend, join};
+use super::links::{pair_seed, release};
+use super::merging::similarity;
+use super::scene::{Component, Landmark, Link, NONE, Placed, Scene, Shot};
+use crate::camera::Intrinsics;
+use crate::geometry::pose_graph::{Graph, Tie, apart};
+use crate::geometry::two_view::median;
+use crate::pose::{Rigid, Similarity};
+
+/// Landmarks that matches must name before they say where a shot is; a share of them must fit for a link to hold.
+const MIN_NAMED: usize = 15;
+const MIN_FITTING: f64 = 0.5;
+/// Shots that a link may wait for others that say the same.
+const MAX_WAIT: usize = 24;
+/// Shots in between from which on a place is seen again.
+const MIN_GAP: usize = 20;
+const MIN_LINKS: usize = 2;
+/// What links may differ in: share of the depth, radians, logarithm of scale.
+const SAME: [f64; 3] = [0.2, 0.07, 0.15];
+const RIVAL: f64 = 0.6;
+/// Of a way's drift: turn in radians, logarithm of scale.
+const MAX_TURN: f64 = 0.35;
+const MAX_SCALE: f64 = 0.3;
+/// Steps of the graph of poses, shots that each is tied to, and standard deviations that links must fit within.
+const MAX_STEPS: usize = 60;
+const N_TIED: usize = 2;
+const MAX_MISFIT: f64 = 4.0;
+/// Landmarks are joined within so many times the error of an inlier, before all is adjusted.
+const LAX_JOIN: f64 = 6.0;
+/// Of the sights before, so many must be left.
+const MIN_LEFT: f64 = 0.95;
+
+/// A link with what it would do to the newer shot's side of the map.
+struct Candidate {
+    ends: (usize, usize),
+    correction: Similarity,
+    /// Landmarks that are the same by it: (the older side's, the newer side's).
+    pairs: Vec<(u32, u32)>,
+}
+
+/// Shots that wait may be placed by whatever they match.
+pub(super) fn release_waiting(scene: &mut Scene) {
+    let waits = |shot: usize| scene.shots[shot].placed.is_none();
+    let ends: Vec<(usize, usize)> = scene.held.keys().copied().collect();
+    let ends: Vec<_> = ends
+        .into_iter()
+        .filter(|e| waits(e.0) || waits(e.1))
+        .collect();
+    ends.into_iter().for_each(|e| release(scene, e));
+}
+
+/// Uses the held links that fit and closes a loop if there is one. `max_drift` as in `align.max_drift`; `None`: no loops.
+pub(super) fn settle(scene: &mut Scene, limits: &Limits, max_drift: Option<f64>) -> bool {
+    let held: Vec<(usize, usize)> = scene.held.keys().copied().collect();
+    let (mut open, mut used) = (Vec::new(), BTreeSet::new());
+    for ends in held {
+        let components = [scene.component_of(ends.0), scene.component_of(ends.1)];
+        if components[0].is_none() || components[1].is_none() || components[0] != components[1] {
+            release(scene, ends);
+        } else if max_drift.is_some() && fits(scene, ends, 2.0 * limits.max_error_px) {
+            release(scene, ends);
+            extend(scene, ends.1, limits.max_error_px);
+            used.insert(ends);
+        } else {
+            open.push(ends);
+        }
+    }
+    let newers: BTreeSet<usize> = used.iter().map(|e| e.1).collect();
+    newers
+        .into_iter()
+        .for_each(|shot| adjust_local(scene, shot, limits));
+    // Where one far place fits as the poses are, another that asks for a correction only looks alike.
+    let far = used.iter().filter(|e| e.0 + MIN_GAP <= e.1);
+    let settled: BTreeSet<usize> = far.map(|e| e.1).collect();
+    let (mut found, mut is_closed) = (Vec::new(), false);
+    if let Some(max_drift) = max_drift {
+        let asking = open.iter().filter(|e| !settled.contains(&e.1));
+        found.extend(asking.filter_map(|e| candidate(scene, *e, limits)));
+        let plausible = |c: &&Candidate| is_plausible(scene, c, max_drift);
+        let best = found
+            .iter()
+            .filter(plausible)
+            .max_by_key(|c| (c.pairs.len(), c.ends));
+        let links = best.and_then(|best| agreeing(scene, &found, best));
+        is_closed = links.is_some_and(|all| close(scene, &all, limits));
+    }
+    let newest = scene.shots.len();
+    let keeps = |ends: &(usize, usize)| max_drift.is_some() && ends.1 + MAX_WAIT > newest;
+    scene.held.retain(|ends, _| keeps(ends));
+    is_closed
+}
+
+/// Whether the landmarks of the older shot lie where the newer one has them.
+fn fits(scene: &Scene, ends: (usize, usize), max_px: f64) -> bool {
+    let (mut n, mut n_fitting) = (0, 0);
+    for &(theirs, ours) in &scene.held[&ends].matches {
+        let landmark = scene.shots[ends.0].landmark_of[theirs as usize];
+        let sight = scene.sight((ends.1 as u32, ours));
+        if let Some(sight) = sight.filter(|_| landmark != NONE) {
+            n += 1;
+            let point = scene.landmarks[landmark as usize].point;
+            n_fitting += usize::from(sight.error_px(point) <= max_px);
+        }
+    }
+    n >= MIN_NAMED && n_fitting as f64 >= MIN_FITTING * n as f64
+}
+
+fn candidate(scene: &Scene, ends: (usize, usize), limits: &Limits) -> Option<Candidate> {
+    let landmark = |shot: usize, feature: u32| scene.shots[shot].landmark_of[feature as usize];
+    let matches = scene.held[&ends].matches.iter();
+    let pairs: Vec<(u32, u32)> = matches
+        .map(|&(theirs, ours)| (landmark(ends.0, theirs), landmark(ends.1, ours)))
+        .filter(|(a, b)| *a != NONE && *b != NONE && a != b)
+        .collect();
+    if pairs.len() < MIN_NAMED {
+        return None;
+    }
+    let limits = Limits {
+        min_inliers: MIN_NAMED,
+        ..*limits
+    };
+    let seed = pair_seed(limits.seed, ends.0, ends.1);
+    let (correction, inliers) = similarity(scene, &pairs, &limits, seed)?;
+    Some(Candidate {
+        ends,
+        correction,
+        pairs: inliers.into_iter().map(|i| pairs[i]).collect(),
+    })
+}
+
+/// Whether the way between both ends may have gathered so much drift.
+fn is_plausible(scene: &Scene, candidate: &Candidate, max_drift: f64) -> bool {
+    let (older, newer) = candidate.ends;
+    let component = scene.component_of(newer);
+    let way: Vec<DVec3> = (older..=newer)
+        .filter(|&s| scene.component_of(s) == component)
+        .filter_map(|s| scene.centre(s))
+        .collect();
+    let length: f64 = way.windows(2).map(|two| two[0].distance(two[1])).sum();
+    let Some(centre) = way.last() else {
+        return false;
+    };
+    let correction = &candidate.correction;
+    let shift = correction.transform_point(*centre).distance(*centre);
+    tracing::debug!(
+        older,
+        newer,
+        shift,
+        length,
+        n = candidate.pairs.len(),
+        "seen again"
+    );
+    shift <= max_drift * length
+        && correction.angle() <= MAX_TURN
+        && correction.scale.ln().abs() <= MAX_SCALE
+}
+
+/// Links that say the same as the one with most landmarks, if they are enough and no other speaks against it; one that no
+/// drift explains does, too: the place looks like others.
+fn agreeing<'a>(
+    scene: &Scene,
+    found: &'a [Candidate],
+    best: &Candidate,
+) -> Option<Vec<&'a Candidate>> {
+    let is_same = |c: &&Candidate| {
+        let (Some(centre), depth) = (scene.centre(c.ends.1), depth(scene, c.ends.1)) else {
+            return false;
+        };
+        let apart = apart(centre, depth, &c.correction, &best.correction);
+        apart.iter().zip(SAME).all(|(off, limit)| *off <= limit)
+    };
+    let all: Vec<&Candidate> = found.iter().filter(is_same).collect();
+    let rivals = found.iter().filter(|c| !is_same(c));
+    let strongest = rivals.map(|c| c.pairs.len()).max().unwrap_or(0);
+    let olders: BTreeSet<usize> = all.iter().map(|c| c.ends.0).collect();
+    let newers: BTreeSet<usize> = all.iter().map(|c| c.ends.1).collect();
+    let is_enough = all.len() >= MIN_LINKS && olders.len() >= 2 && newers.len() >= 2;
+    let is_clear = strongest as f64 <= RIVAL * best.pairs.len() as f64;
+    (is_enough && is_clear).then_some(all)
+}
+
+fn depth(scene: &Scene, shot: usize) -> f64 {
+    median(&mut scene.depths(shot)).unwrap_or(1.0)
+}
+
+fn close(scene: &mut Scene, links: &[&Candidate], limits: &Limits) -> bool {
+    let Some(component) = scene.component_of(links[0].ends.1) else {
+        return false;
+    };
+    let backup = Backup::of(scene);
+    let before = n_sights(scene, component);
+    let is_bent = bend(scene, component, links);
+    if is_bent {
+        for link in links {
+            release(scene, link.ends);
+            for &(a, b) in &link.pairs {
+                let is_there = |l: u32| !scene.landmarks[l as usize].seen.is_empty();
+                if is_there(a) && is_there(b) {
+                    join(scene, a, b, LAX_JOIN * limits.max_error_px);
+                }
+            }
+        }
+        adjust_global(scene, component, 2.0 * limits.max_error_px, 15);
+        for link in links {
+            extend(scene, link.ends.1, limits.max_error_px);
+        }
+        adjust_global(scene, component, limits.max_error_px, 15);
+    }
+    let after = n_sights(scene, component);
+    let is_good = is_bent && after as f64 >= MIN_LEFT * before as f64;
+    let ends: Vec<(usize, usize)> = links.iter().map(|l| l.ends).collect();
+    tracing::info!(
+        ?ends,
+        is_bent,
+        before,
+        after,
+        "{}",
+        if is_good {
+            "a loop is closed"
+        } else {
+            "a loop is refused"
+        }
+    );
+    if is_good {
+        scene.closed.extend(ends);
+    } else {
+        backup.put_back(scene);
+        ends.iter().for_each(|e| {
+            scene.held.remove(e);
+        });
+    }
+    is_good
+}
+
+fn n_sights(scene: &Scene, component: u32) -> usize {
+    let of_component = scene.landmarks.iter().filter(|l| l.component == component);
+    of_component.map(|l| l.seen.len()).sum()
+}
+
+/// Spreads what the links ask for over the way; landmarks go with the first shot that sees them.
+fn bend(scene: &mut Scene, component: u32, links: &[&Candidate]) -> bool {
+    let mut shots = scene.components[component as usize].shots.clone();
+    let first = shots[0];
+    shots.sort_unstable();
+    let ix_of: BTreeMap<usize, usize> = shots.iter().enumerate().map(|(ix, s)| (*s, ix)).collect();
+    let pose = |s: &usize| {
+        scene.shots[*s]
+            .placed
+            .map_or(Rigid::IDENTITY, |p| p.cam_from_map.inverse())
+    };
+    let before: Vec<Similarity> = shots.iter().map(|s| pose(s).into()).collect();
+    let depths: Vec<f64> = shots.iter().map(|s| depth(scene, *s)).collect();
+    let mut ties = Vec::new();
+    for (second, depth) in depths.iter().enumerate() {
+        let near = second.saturating_sub(N_TIED)..second;
+        ties.extend(near.map(|first| Tie::as_is(&before, (first, second), *depth)));
+    }
+    let ix = |(a, b): (usize, usize)| Some((*ix_of.get(&a)?, *ix_of.get(&b)?));
+    let closed = scene.closed.iter().filter_map(|ends| ix(*ends));
+    ties.extend(closed.map(|ends| Tie::as_is(&before, ends, depths[ends.1])));
+    for link in links {
+        let Some(ends) = ix(link.ends) else {
+            return false;
+        };
+        let first_from_second = before[ends.0].inverse() * link.correction * before[ends.1];
+        ties.push(Tie::link(first_from_second, ends, depths[ends.1]));
+    }
+    let mut graph = Graph {
+        nodes: before.clone(),
+        is_held: shots.iter().map(|s| *s == first).collect(),
+        ties,
+        moves_scale: true,
+    };
+    let relaxed = graph.relax(MAX_STEPS);
+    let misfit = graph.mean_misfit();
+    tracing::debug!(?relaxed, misfit, "graph");
+    if misfit.is_nan() || misfit > MAX_MISFIT || !graph.nodes.iter().all(Similarity::is_finite) {
+        return false;
+    }
+    for landmark in scene.landmarks_of(&shots) {
+        let landmark = &mut scene.landmarks[landmark as usize];
+        let owner = landmark
+            .seen
+            .first()
+            .and_then(|at| ix_of.get(&(at.0 as usize)));
+        if let Some(&owner) = owner {
+            let moved = graph.nodes[owner] * before[owner].inverse();
+            landmark.point = moved.transform_point(landmark.point);
+        }
+    }
+    for (shot, node) in shots.iter().zip(&graph.nodes) {
+        if let Some(placed) = &mut scene.shots[*shot].placed {
+            let pose = Rigid::new(node.rotation, node.translation).renormalized();
+            placed.cam_from_map = pose.inverse();
+        }
+    }
+    true
+}
+
+struct KeptShot {
+    placed: Option<Placed>,
+    landmark_of: Vec<u32>,
+    matched: Vec<Vec<(u32, u32)>>,
+    lens: Intrinsics,
+}
+
+/// All that closing a loop may change.
+struct Backup {
+    landmarks: Vec<Landmark>,
+    components: Vec<Component>,
+    links: BTreeMap<(usize, usize), Link>,
+    held: BTreeMap<(usize, usize), Link>,
+    radial: f64,
+    shots: Vec<KeptShot>,
+}
+
+impl Backup {
+    fn of(scene: &Scene) -> Self {
+        let shot = |shot: &Shot| KeptShot {
+            placed: shot.placed,
+            landmark_of: shot.landmark_of.clone(),
+            matched: shot.matched.clone(),
+            lens: shot.lens,
+        };
+        Self {
+            landmarks: scene.landmarks.clone(),
+            components: scene.components.clone(),
+            links: scene.links.clone(),
+            held: scene.held.clone(),
+            radial: scene.radial,
+            shots: scene.shots.iter().map(shot).collect(),
+        }
+    }
+
+    fn put_back(self, scene: &mut Scene) {
+        (scene.landmarks, scene.components) = (self.landmarks, self.components);
+        (scene.links, scene.held, scene.radial) = (self.links, self.held, self.radial);
+        for (shot, kept) in scene.shots.iter_mut().zip(self.shots) {
+            (shot.placed, shot.landmark_of) = (kept.placed, kept.landmark_of);
+            (shot.matched, shot.lens) = (kept.matched, kept.lens);
+        }
+        scene.straighten();
+    }
+}

@@ -1,0 +1,235 @@
+//! What the map makes of keyframes that the model moves: splats go along, clients hear of it.
+
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use splat_mapper::config::MapParams;
+use splat_mapper::eval::image_metrics;
+use splat_mapper::frame::{Batch, RgbImage};
+use splat_mapper::geometry::{GeometryBatch, Revision, View};
+use splat_mapper::map::SplatMap;
+use splat_mapper::map::correction::Reason;
+use splat_mapper::map::snapshot::Scale;
+use splat_mapper::pose::Similarity;
+use splat_mapper::splat::cpu::CpuEngine;
+
+use crate::loops::{Filmed, film};
+use crate::sfm::params;
+
+/// Two renderings of the same splats from places that correspond; rounding of f32.
+const SAME_DB: f64 = 45.0;
+
+fn filmed() -> Filmed {
+    film("room?frames=24&width=96&height=72&speed=2", 3)
+}
+
+fn map() -> SplatMap {
+    let map = MapParams {
+        holdout: 0,
+        seeds_per_keyframe: 1500,
+        ..params(&[]).map
+    };
+    SplatMap::new(map, 1, Scale::UP_TO_SCALE, Box::new(CpuEngine::new()))
+}
+
+/// Keyframes `range` as views of a component.
+fn add(map: &mut SplatMap, filmed: &Filmed, range: std::ops::Range<usize>, component: u32) {
+    let view = |v: &View| View {
+        component,
+        ..v.clone()
+    };
+    let batch = Batch {
+        id: range.start as u32,
+        n_shared: 0,
+        keyframes: filmed.keyframes[range.clone()].to_vec(),
+    };
+    let geometry = GeometryBatch {
+        views: filmed.views[range].iter().map(view).collect(),
+        ..GeometryBatch::default()
+    };
+    map.add(Some(&batch), geometry, None);
+}
+
+fn revised(views: &[View], new_from_old: &Similarity, component: u32) -> GeometryBatch {
+    let revision = |v: &View| Revision {
+        keyframe_id: v.keyframe_id,
+        component,
+        intrinsics: v.intrinsics,
+        batch_from_cam: new_from_old.transform_pose(&v.batch_from_cam),
+        depth_factor: new_from_old.scale,
+    };
+    GeometryBatch {
+        revised: views.iter().map(revision).collect(),
+        is_loop: true,
+        ..GeometryBatch::default()
+    }
+}
+
+fn shown(map: &mut SplatMap, id: u32) -> RgbImage {
+    let (rendering, photo) = map.render_keyframe(id).unwrap();
+    RgbImage {
+        pixels: rendering
+            .rgb
+            .iter()
+            .map(|c| (c * 255.0).round() as u8)
+            .collect(),
+        ..(*photo).clone()
+    }
+}
+
+fn motion() -> Similarity {
+    Similarity {
+        scale: 1.3,
+        rotation: DQuat::from_scaled_axis(DVec3::new(0.3, -0.5, 0.2)),
+        translation: DVec3::new(1.0, -0.4, 0.7),
+    }
+}
+
+fn assert_same_pictures(map: &mut SplatMap, before: &[RgbImage]) {
+    for (id, before) in (0..).zip(before) {
+        let (rendering, _) = map.render_keyframe(id).unwrap();
+        let psnr = image_metrics::psnr(&rendering.rgb, before);
+        assert!(psnr > SAME_DB, "keyframe {id}: {psnr:.1} dB");
+    }
+}
+
+#[test]
+fn splats_move_turn_and_grow_with_their_keyframes() {
+    let filmed = filmed();
+    let mut map = map();
+    add(&mut map, &filmed, 0..6, 0);
+    let before: Vec<RgbImage> = (0..6).map(|id| shown(&mut map, id)).collect();
+    let old = map.snapshot();
+    assert!(map.take_correction().is_none());
+    map.add(None, revised(&filmed.views[..6], &motion(), 0), None);
+    assert_same_pictures(&mut map, &before);
+    let new = map.snapshot();
+    assert_eq!(new.epoch, old.epoch + 1);
+    let correction = map.take_correction().unwrap();
+    assert_eq!(
+        (correction.epoch, correction.revision),
+        (new.epoch, new.revision)
+    );
+    assert_eq!(correction.reason, Reason::Loop);
+    let found = correction.new_map_from_old_map;
+    assert!((found.scale - 1.3).abs() < 1e-6, "{found:?}");
+    assert!((motion().inverse() * found).angle() < 1e-6);
+    assert!(correction.shift > 0.5 && correction.turn > 0.5);
+    let (a, b) = (old.splats.log_scales[0], new.splats.log_scales[0]);
+    assert!((b[0] - a[0] - 1.3f32.ln()).abs() < 1e-5);
+    assert!(map.take_correction().is_none(), "told once");
+    let depth = |map: &mut SplatMap| map.keyframe_views()[2].depth.median().unwrap();
+    let wanted = 1.3 * filmed.views[2].depth.median().unwrap();
+    assert!((depth(&mut map) / wanted - 1.0).abs() < 1e-5);
+}
+
+#[test]
+fn a_small_revision_is_no_correction() {
+    let filmed = filmed();
+    let mut map = map();
+    add(&mut map, &filmed, 0..6, 0);
+    let before = map.snapshot();
+    let little = Similarity {
+        translation: DVec3::X * 0.004,
+        ..Similarity::IDENTITY
+    };
+    map.add(None, revised(&filmed.views[2..4], &little, 0), None);
+    let after = map.snapshot();
+    assert_ne!(after.poses[2], before.poses[2]);
+    assert_eq!(after.epoch, before.epoch);
+    assert!(map.take_correction().is_none());
+}
+
+#[test]
+fn two_corrections_that_nobody_asked_for_are_told_as_one() {
+    let filmed = filmed();
+    let mut map = map();
+    add(&mut map, &filmed, 0..6, 0);
+    map.add(None, revised(&filmed.views[..6], &motion(), 0), None);
+    let twice = motion() * motion();
+    let mut second = revised(&filmed.views[..6], &twice, 0);
+    // A revision states depth beside what was told last.
+    let news = second.revised.iter_mut();
+    news.for_each(|r| r.depth_factor = motion().scale);
+    map.add(None, second, None);
+    let found = map.take_correction().unwrap().new_map_from_old_map;
+    assert!((twice.inverse() * found).angle() < 1e-6);
+    let at = filmed.views[5].batch_from_cam.translation;
+    let off = twice
+        .transform_point(at)
+        .distance(found.transform_point(at));
+    assert!(off < 1e-4, "{off}");
+}
+
+#[test]
+fn a_component_that_is_linked_joins_the_map_in_its_unit() {
+    let filmed = filmed();
+    let mut map = map();
+    add(&mut map, &filmed, 0..4, 0);
+    // The same room in another frame and unit.
+    let own_from_map = motion().inverse();
+    let mut elsewhere = Filmed {
+        views: filmed.views.clone(),
+        keyframes: filmed.keyframes.iter().map(Arc::clone).collect(),
+    };
+    for view in &mut elsewhere.views {
+        view.batch_from_cam = own_from_map.transform_pose(&view.batch_from_cam);
+        view.depth.scale(own_from_map.scale);
+    }
+    add(&mut map, &elsewhere, 4..8, 1);
+    assert_eq!(map.components(), [4, 4]);
+    let geometry = revised(&elsewhere.views[4..8], &motion(), 0);
+    map.add(None, geometry, None);
+    assert_eq!(map.components(), [8]);
+    let snapshot = map.snapshot();
+    for (pose, truth) in snapshot.poses.iter().zip(&filmed.views) {
+        let off = pose
+            .map_from_cam
+            .translation
+            .distance(truth.batch_from_cam.translation);
+        assert!(off < 1e-6, "keyframe {}: {off}", pose.keyframe_id);
+    }
+    let found = map.keyframe_views()[6].depth.median().unwrap();
+    let wanted = filmed.views[6].depth.median().unwrap();
+    assert!((found / wanted - 1.0).abs() < 1e-5, "{found} {wanted}");
+    let correction = map.take_correction().unwrap();
+    assert_eq!(correction.reason, Reason::Merge);
+    assert_eq!(correction.new_map_from_old_map, Similarity::IDENTITY);
+}
+
+#[test]
+fn a_map_whose_component_joins_another_stays_where_it_is() {
+    let filmed = filmed();
+    let mut map = map();
+    add(&mut map, &filmed, 0..4, 3);
+    let before: Vec<RgbImage> = (0..4).map(|id| shown(&mut map, id)).collect();
+    let old = map.snapshot();
+    let geometry = revised(&filmed.views[..4], &motion(), 2);
+    map.add(None, geometry, None);
+    assert_same_pictures(&mut map, &before);
+    let new = map.snapshot();
+    assert_eq!(new.epoch, old.epoch, "nothing moved");
+    for (a, b) in old.poses.iter().zip(&new.poses) {
+        assert!(
+            a.map_from_cam
+                .translation
+                .distance(b.map_from_cam.translation)
+                < 1e-6
+        );
+    }
+    let mut moved = Filmed {
+        views: filmed.views.clone(),
+        keyframes: filmed.keyframes.iter().map(Arc::clone).collect(),
+    };
+    for view in &mut moved.views {
+        view.batch_from_cam = motion().transform_pose(&view.batch_from_cam);
+        view.depth.scale(motion().scale);
+    }
+    add(&mut map, &moved, 4..8, 2);
+    assert_eq!(map.components(), [8]);
+    let pose = map.snapshot().poses[6].map_from_cam;
+    let off = pose
+        .translation
+        .distance(filmed.views[6].batch_from_cam.translation);
+    assert!(off < 1e-6, "{off}");
+}
