@@ -4,6 +4,7 @@
 //! encapsulation header, which says little (CDR_LE) or big endian (CDR_BE). Knows nothing of files or networks.
 
 pub mod odometry;
+mod rigid;
 pub mod standard;
 
 use serde::de::DeserializeOwned;
@@ -212,37 +213,6 @@ impl Default for Quaternion {
 pub struct Pose {
     pub position: Vector3,
     pub orientation: Quaternion,
-}
-
-impl From<crate::pose::Rigid> for Pose {
-    fn from(rigid: crate::pose::Rigid) -> Self {
-        let (t, q) = (rigid.translation, rigid.rotation);
-        Self {
-            position: Vector3 {
-                x: t.x,
-                y: t.y,
-                z: t.z,
-            },
-            orientation: Quaternion {
-                x: q.x,
-                y: q.y,
-                z: q.z,
-                w: q.w,
-            },
-        }
-    }
-}
-
-impl Pose {
-    /// `None` when a number is not finite or the quaternion has no length.
-    pub fn to_rigid(self) -> Option<crate::pose::Rigid> {
-        let q = self.orientation;
-        let rotation = glam::DQuat::from_xyzw(q.x, q.y, q.z, q.w);
-        let length = rotation.length();
-        let translation = glam::DVec3::new(self.position.x, self.position.y, self.position.z);
-        (translation.is_finite() && length.is_finite() && length > 1e-6)
-            .then(|| crate::pose::Rigid::new(rotation / length, translation))
-    }
 }
 
 /// `geometry_msgs/msg/PoseStamped`.

@@ -28,10 +28,10 @@ mod joined {
     use crate::config::Settings;
     use crate::node::Stop;
     use crate::publish::face::Face;
+    use crate::publish::offered::SERVICES;
     use crate::publish::outbox::{Outbox, TOPICS};
     use crate::publish::ros2::lifecycle::Hands;
     use crate::publish::ros2::{self, Ros2Face};
-    use crate::publish::service::SERVICES;
     use crate::source::ros2::link::{Link, NODE_NAME};
 
     #[derive(Debug)]

@@ -132,15 +132,13 @@ impl Assembler {
             sh_degree: chunk.sh_degree,
         };
         let n_bytes = chunk.data.len();
-        let n_splats =
-            n_bytes / layout::bytes_per_splat(shape.sh_degree.min(layout::MAX_SH_DEGREE));
+        let n_splats = chunk.ids.len();
         let is_sound = shape.sh_degree <= layout::MAX_SH_DEGREE
             && n_bytes > 0
             && n_bytes <= MAX_MESSAGE_BYTES
-            && n_bytes.is_multiple_of(layout::bytes_per_splat(shape.sh_degree))
+            && n_bytes == n_splats * layout::bytes_per_splat(shape.sh_degree)
             && chunk.chunk_ix < shape.n_chunks
             && chunk.first_splat < shape.n_splats
-            && chunk.ids.len() == n_splats
             && crc32c::crc32c(&chunk.data) == chunk.crc32c;
         self.add(
             &identity,

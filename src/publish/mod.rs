@@ -14,6 +14,7 @@ pub mod delta;
 pub mod face;
 pub mod follow;
 pub mod live;
+pub mod offered;
 pub mod outbox;
 pub mod overview;
 mod recording;

@@ -20,7 +20,8 @@ use crate::config::PublishParams;
 use crate::publish::PublishError;
 use crate::publish::archive::Archive;
 use crate::publish::face::{Delivery, Face, Post, Topic};
-use crate::publish::service::{Desk, SERVICES, Service};
+use crate::publish::offered::{SERVICES, Service};
+use crate::publish::service::Desk;
 use crate::publish::zenoh_names::Names;
 use crate::publish::zenoh_session::open_session;
 

@@ -5,7 +5,7 @@ use zenoh::Session;
 use crate::config::PublishParams;
 use crate::publish::PublishError;
 use crate::publish::face::{Delivery, Topic};
-use crate::publish::service::Service;
+use crate::publish::offered::Service;
 use crate::publish::type_hash::{dds_name, hash_of, service_hash};
 
 pub(super) struct Names {

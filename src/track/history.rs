@@ -96,6 +96,13 @@ impl History {
 }
 
 impl Tracker {
+    /// Where the camera was on the last frame with a pose, by the map of this moment.
+    pub fn last_pose(&self) -> Option<Rigid> {
+        self.motion
+            .as_ref()
+            .map(|motion| motion.cam_from_map.inverse())
+    }
+
     pub(super) fn told(&self, kept: &Kept) -> FrameTrack {
         FrameTrack {
             refined: kept.anchor.and_then(|anchor| self.pose_by(&anchor)),

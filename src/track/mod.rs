@@ -158,13 +158,6 @@ impl Tracker {
         self.state
     }
 
-    /// Where the camera was on the last frame with a pose, by the map of this moment.
-    pub fn last_pose(&self) -> Option<Rigid> {
-        self.motion
-            .as_ref()
-            .map(|motion| motion.cam_from_map.inverse())
-    }
-
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
         let seen = Arc::new(Seen::of(frame, &self.params));

@@ -103,7 +103,7 @@ fn params(sets: &[&str]) -> Params {
 fn map(frames: &[Frame], sets: &[&str]) -> Outcome {
     let job = Job {
         source: Box::new(Frames {
-            all: frames.to_vec().into_iter(),
+            all: Vec::from(frames).into_iter(),
             n_given: 0,
         }),
         params: params(sets),

@@ -75,4 +75,5 @@ mod topics;
 mod tracking;
 mod tracking_node;
 mod trajectory;
+mod type_hashes;
 mod xfeat;

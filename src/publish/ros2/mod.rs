@@ -129,8 +129,8 @@ fn qos(delivery: Delivery) -> QosProfile {
 mod tests {
     use std::path::{Path, PathBuf};
 
+    use crate::publish::offered::SERVICES;
     use crate::publish::outbox::TOPICS;
-    use crate::publish::service::SERVICES;
     use crate::publish::type_hash::{hash_of, service_hash};
 
     /// What rosidl computed when the interface package was built.

@@ -1,0 +1,37 @@
+//! Poses of messages <-> rigid motions.
+
+use glam::{DQuat, DVec3};
+
+use super::{Pose, Quaternion, Vector3};
+use crate::pose::Rigid;
+
+impl From<Rigid> for Pose {
+    fn from(rigid: Rigid) -> Self {
+        let (t, q) = (rigid.translation, rigid.rotation);
+        Self {
+            position: Vector3 {
+                x: t.x,
+                y: t.y,
+                z: t.z,
+            },
+            orientation: Quaternion {
+                x: q.x,
+                y: q.y,
+                z: q.z,
+                w: q.w,
+            },
+        }
+    }
+}
+
+impl Pose {
+    /// `None` when a number is not finite or the quaternion has no length.
+    pub fn to_rigid(self) -> Option<Rigid> {
+        let q = self.orientation;
+        let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
+        let length = rotation.length();
+        let translation = DVec3::new(self.position.x, self.position.y, self.position.z);
+        (translation.is_finite() && length.is_finite() && length > 1e-6)
+            .then(|| Rigid::new(rotation / length, translation))
+    }
+}
