@@ -19,7 +19,7 @@ use crate::source::decode;
 const JPEG_QUALITY: u8 = 92;
 const MAX_DEPTH_SIDE: u32 = 160;
 /// Largest code of a depth; 0 is none.
-const MAX_CODE: f32 = 65_535.0;
+const MAX_CODE: f32 = 65_534.0;
 /// `decode::depth_png` gives thousandths.
 const CODES_PER_UNIT: f32 = 1000.0;
 

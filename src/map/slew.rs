@@ -97,7 +97,8 @@ impl Slew {
 }
 
 fn share(left: f64, may: f64) -> f64 {
-    if left <= may { 1.0 } else { may / left }
+    // No limit times no time is no number; then nothing is too far.
+    if left > may { may / left } else { 1.0 }
 }
 
 fn turned(from: DQuat, to: DQuat, share: f64) -> DQuat {

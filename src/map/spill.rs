@@ -201,7 +201,8 @@ mod tests {
     #[test]
     fn records_come_back_and_their_space_is_used_again() {
         let folder = tempfile::tempdir().unwrap();
-        let spill = Spill::new(folder.path(), 1000).unwrap();
+        // Four records of up to 160 bytes, and gaps between them.
+        let spill = Spill::new(folder.path(), 1600).unwrap();
         assert_eq!(
             std::fs::read_dir(folder.path()).unwrap().count(),
             0,
@@ -223,7 +224,7 @@ mod tests {
         held.clear();
         assert_eq!(spill.held_bytes(), 0);
         assert!(
-            spill.put(&[0; 1001]).unwrap().is_none(),
+            spill.put(&[0; 1601]).unwrap().is_none(),
             "the file has a limit"
         );
     }
