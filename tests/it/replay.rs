@@ -259,7 +259,7 @@ fn bad_arguments_end_with_one_line_and_their_code() {
     check(
         &["run", "--source", "v4l2:/dev/video9"],
         1,
-        &["not in this build"],
+        &["no camera is there"],
     );
     check(
         &["replay", DEMO, "--geometry", "onnx:model.onnx"],
