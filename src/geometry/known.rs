@@ -95,6 +95,7 @@ impl Known {
         let Some(aligner) = &mut self.aligner else {
             return Ok(GeometryBatch::default());
         };
+        aligner.note_stamps(batch.keyframes.iter().map(|k| (k.id, k.frame.stamp)));
         let joined = aligner.place(window, &pictures, true);
         tracing::debug!(batch = batch.id, fit = ?joined.fit, refined = ?joined.refined, "window");
         Ok(GeometryBatch {

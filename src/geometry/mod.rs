@@ -11,6 +11,7 @@ pub mod onnx;
 pub mod pnp;
 pub mod pose_graph;
 pub mod scale_space;
+pub mod seen_again;
 pub mod sfm;
 pub mod triangulate;
 pub mod two_view;

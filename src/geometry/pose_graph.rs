@@ -29,6 +29,11 @@ const STEP_SCALE: f64 = 0.01;
 const LINK_PLACE: f64 = 0.04;
 const LINK_TURN: f64 = 0.015;
 const LINK_SCALE: f64 = 0.03;
+/// Neighbours that a node on a way is tied to, steps that spread what links ask for, and standard deviations that these
+/// must fit within on average then.
+const N_TIED: usize = 2;
+const MAX_STEPS: usize = 60;
+const MAX_MISFIT: f64 = 4.0;
 const FIRST_DAMPING: f64 = 1e-4;
 const MAX_DAMPING: f64 = 1e8;
 /// Less than this share of the cost gained by a step ends it.
@@ -84,6 +89,16 @@ impl Tie {
         }
     }
 
+    /// Keeps a way as it lies: each of its nodes is tied to the ones before it. `depth` as a node sees it.
+    pub fn along(way: &[usize], nodes: &[Similarity], depth: impl Fn(usize) -> f64) -> Vec<Self> {
+        let tied = |(at, &second): (usize, &usize)| {
+            let near = &way[at.saturating_sub(N_TIED)..at];
+            let tie = |&first: &usize| Self::as_is(nodes, (first, second), depth(second));
+            near.iter().map(tie).collect::<Vec<Self>>()
+        };
+        way.iter().enumerate().flat_map(tied).collect()
+    }
+
     /// A place that was seen from both.
     pub fn link(
         first_from_second: Similarity,
@@ -126,6 +141,14 @@ impl Graph {
         let doubtful = self.ties.iter().filter(|t| t.is_doubtful);
         let (sum, n) = doubtful.fold((0.0, 0.0), |(sum, n), t| (sum + self.misfit(t), n + 1.0));
         sum / n
+    }
+
+    /// Spreads what doubtful ties ask for over the rest; `false` where they do not fit even then, or there are none.
+    pub fn spread(&mut self) -> bool {
+        let relaxed = self.relax(MAX_STEPS);
+        let misfit = self.mean_misfit();
+        tracing::debug!(?relaxed, misfit, "graph");
+        misfit <= MAX_MISFIT && self.nodes.iter().all(Similarity::is_finite)
     }
 
     /// Moves all nodes but the held ones so that their ties fit, at most so many steps with each bend of the loss.

@@ -15,12 +15,6 @@ use crate::geometry::View;
 use crate::geometry::pose_graph::{Graph, Tie};
 use crate::pose::{Rigid, Similarity};
 
-/// Steps of the graph of poses.
-const MAX_STEPS: usize = 60;
-/// Neighbours that a keyframe is tied to.
-const N_TIED: usize = 2;
-/// Links must fit the graph within so many standard deviations on average.
-const MAX_MISFIT: f64 = 4.0;
 /// Of what matches along the way agreed on before, so much must be left.
 const MIN_LEFT: f64 = 0.9;
 
@@ -107,11 +101,7 @@ impl Whole {
         let Some(mut graph) = self.graph(ids, links, sides) else {
             return false;
         };
-        let relaxed = graph.relax(MAX_STEPS);
-        let misfit = graph.mean_misfit();
-        let is_sound = graph.nodes.iter().all(Similarity::is_finite);
-        tracing::debug!(?relaxed, misfit, is_sound, "graph");
-        if misfit.is_nan() || misfit > MAX_MISFIT || !is_sound {
+        if !graph.spread() {
             return false;
         }
         let stays = sides[0].min(sides[1]);
@@ -138,12 +128,7 @@ impl Whole {
             let own: Vec<usize> = (0..ids.len())
                 .filter(|&ix| views[ix].component == side)
                 .collect();
-            for (at, &second) in own.iter().enumerate() {
-                let near = own[at.saturating_sub(N_TIED)..at].iter();
-                ties.extend(
-                    near.map(|&first| Tie::as_is(&poses, (first, second), depth(views[second]))),
-                );
-            }
+            ties.extend(Tie::along(&own, &poses, |ix| depth(views[ix])));
         }
         let closed = self.closed.iter().filter_map(|(older, newer)| {
             let (first, second) = (*ix_of.get(older)?, *ix_of.get(newer)?);

@@ -1,25 +1,25 @@
 //! A new keyframe -> links to places that were seen long before, each checked by pixels, depth and its neighbours.
 //!
-//! Places that look alike are no rarer than places seen again, so a link is believed only if (1) keyframes beside both
-//! ends say the same, (2) no other place fits about as well, poses as they are included, and (3) it asks for no larger a drift than the way between
-//! may have gathered: a corridor of equal doors asks for as much as was walked.
+//! The gates are those of `geometry::seen_again`: here keyframes beside both ends are asked, and poses as they are count
+//! as a place, too.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::link::{Link, Seen, verified};
 use super::matches::Matcher;
+use crate::clock::Stamp;
 use crate::config::align::AlignParams;
+use crate::geometry::seen_again::{self, MIN_GAP, MIN_LINKS, RIVAL, Stand};
 use crate::geometry::{View, pose_graph};
 use crate::pose::Similarity;
 
 /// What is remembered of keyframes: with a grid of depths each, and the depth of each feature.
 pub(super) type Kept = BTreeMap<u32, (View, Vec<Option<f64>>)>;
 
-/// Keyframes in between from which on a place is seen again; nearer ones are matched anyway.
-pub(super) const MIN_GAP: u32 = 20;
 /// Matching signatures below which two pictures do not look alike.
 const MIN_VOTES: usize = 6;
 /// Places that a keyframe is compared with, and how many keyframes one place takes.
@@ -27,22 +27,12 @@ const N_PLACES: usize = 8;
 const PLACE: u32 = 3;
 /// Neighbours of both ends that are asked, to each side.
 const N_BESIDE: usize = 2;
-/// Links that must agree: within a component, and between two of which nothing else is known.
-const MIN_LINKS: usize = 2;
+/// Links that must agree between two components, of which nothing else is known.
 const MIN_LINKS_ACROSS: usize = 4;
-/// What links may differ in: share of the depth, radians, logarithm of scale.
-const SAME_PLACE: f64 = 0.2;
-const SAME_TURN: f64 = 0.07;
-const SAME_SCALE: f64 = 0.15;
-/// Another place that has this share of a link's matches makes it doubtful.
-const RIVAL: f64 = 0.6;
 /// A correction below this is left to the adjustment of all: share of the depth, radians, logarithm of scale.
 const SMALL_SHIFT: f64 = 0.1;
 const SMALL_TURN: f64 = 0.02;
 const SMALL_SCALE: f64 = 0.06;
-/// Of a way's drift: turn in radians, and logarithm of scale.
-const MAX_TURN: f64 = 0.35;
-const MAX_SCALE: f64 = 0.3;
 /// Links that wait for a neighbour's word.
 const MAX_PENDING: usize = 12;
 
@@ -51,6 +41,8 @@ pub(super) struct Loops {
     pending: Vec<Link>,
     /// Pairs that led to nothing good.
     refused: BTreeSet<(u32, u32)>,
+    /// When keyframes were taken, as far as that was said.
+    stamps: BTreeMap<u32, Stamp>,
 }
 
 /// Links of a new keyframe, and where they would have the newer end's side of the map.
@@ -91,6 +83,10 @@ impl Loops {
         Vec::new()
     }
 
+    pub(super) fn note_stamps(&mut self, stamps: impl Iterator<Item = (u32, Stamp)>) {
+        self.stamps.extend(stamps);
+    }
+
     /// They did more harm than good.
     pub(super) fn refuse(&mut self, links: &[Link]) {
         self.refused.extend(links.iter().map(Link::ends));
@@ -100,6 +96,7 @@ impl Loops {
     pub(super) fn forget_before(&mut self, id: u32) {
         self.refused.retain(|(older, _)| *older >= id);
         self.pending.retain(|l| l.older >= id);
+        self.stamps.retain(|taken, _| *taken >= id);
     }
 
     /// The place that fits best, if it asks for a correction that may be and no other place fits about as well.
@@ -121,7 +118,7 @@ impl Loops {
         let is_rivalled = rival
             .as_ref()
             .is_some_and(|r| r.link.n as f64 > RIVAL * best.link.n as f64);
-        let is_plausible = is_plausible(kept, &best, params.max_drift);
+        let is_plausible = self.is_plausible(kept, &best, params.max_drift);
         let needed = is_needed(kept, &best);
         tracing::debug!(
             id,
@@ -149,6 +146,75 @@ impl Loops {
         let correction = correction(kept, &link)?;
         Some(Best { link, correction })
     }
+
+    /// Whether the way between both ends may have gathered so much drift; between two components, whether the camera can
+    /// have gone from one to the other at all.
+    fn is_plausible(&self, kept: &Kept, best: &Best, max_drift: f64) -> bool {
+        let (older, newer) = best.link.ends();
+        let sides = [component(kept, older), component(kept, newer)];
+        if sides[0] == sides[1] {
+            let way: Vec<DVec3> = centres(kept, older..=newer, sides[0])
+                .map(|c| c.1)
+                .collect();
+            return seen_again::may_have_drifted(&way, &best.correction, max_drift);
+        }
+        let stands = |side: Option<u32>, moved: Similarity| -> Vec<(u32, Stand)> {
+            let all = centres(kept, 0..=u32::MAX, side);
+            let stand = |(id, at)| Some((id, (*self.stamps.get(&id)?, moved.transform_point(at))));
+            all.filter_map(stand).collect()
+        };
+        let ours = stands(sides[0], Similarity::IDENTITY);
+        let theirs = stands(sides[1], best.correction);
+        can_follow(&ours, &theirs, best.link.ends(), max_drift)
+            && can_follow(&theirs, &ours, (newer, older), max_drift)
+    }
+}
+
+/// Keyframes of a component with their places in its map.
+fn centres(
+    kept: &Kept,
+    ids: RangeInclusive<u32>,
+    side: Option<u32>,
+) -> impl Iterator<Item = (u32, DVec3)> {
+    kept.range(ids)
+        .map(|(id, (view, _))| (*id, view))
+        .filter(move |(_, view)| Some(view.component) == side)
+        .map(|(id, view)| (id, view.batch_from_cam.translation))
+}
+
+/// Wherever the camera went from the one part to the other with nothing known in between. `ends` of the link, the first
+/// one in `from`.
+fn can_follow(
+    from: &[(u32, Stand)],
+    to: &[(u32, Stand)],
+    ends: (u32, u32),
+    max_drift: f64,
+) -> bool {
+    let length = |part: &[Stand]| -> f64 {
+        let steps = part.windows(2).map(|two| two[0].1.distance(two[1].1));
+        steps.sum()
+    };
+    let between = |part: &[(u32, Stand)], a: u32, b: u32| -> Vec<Stand> {
+        let (low, high) = (a.min(b), a.max(b));
+        let inside = part.iter().filter(|(id, _)| (low..=high).contains(id));
+        inside.map(|(_, stand)| *stand).collect()
+    };
+    from.iter().enumerate().all(|(ix, (id, _))| {
+        let next = to.partition_point(|(other, _)| other < id);
+        let Some((begin, _)) = to.get(next) else {
+            return true;
+        };
+        if from
+            .get(ix + 1)
+            .is_some_and(|(follower, _)| follower < begin)
+        {
+            return true;
+        }
+        let before: Vec<Stand> = from[..=ix].iter().map(|(_, stand)| *stand).collect();
+        let behind: Vec<Stand> = to[next..].iter().map(|(_, stand)| *stand).collect();
+        let way = length(&between(from, ends.0, *id)) + length(&between(to, ends.1, *begin));
+        seen_again::may_have_walked((&before, &behind), way, max_drift)
+    })
 }
 
 fn link(kept: &Kept, matcher: &Matcher, ends: (u32, u32), params: &AlignParams) -> Option<Link> {
@@ -273,21 +339,15 @@ fn agrees(kept: &Kept, best: &Best, link: &Link) -> bool {
     is_between && theirs.is_some_and(|c| is_same(kept, best.link.newer, &c, &best.correction))
 }
 
-fn apart(kept: &Kept, id: u32, a: &Similarity, b: &Similarity) -> Option<[f64; 3]> {
+/// Where the camera stood, and how deep it saw.
+fn place(kept: &Kept, id: u32) -> Option<(DVec3, f64)> {
     let (view, _) = kept.get(&id)?;
     let depth = f64::from(view.depth.median()?);
-    Some(pose_graph::apart(
-        view.batch_from_cam.translation,
-        depth,
-        a,
-        b,
-    ))
+    Some((view.batch_from_cam.translation, depth))
 }
 
 fn is_same(kept: &Kept, id: u32, a: &Similarity, b: &Similarity) -> bool {
-    apart(kept, id, a, b).is_some_and(|[shift, turn, scale]| {
-        shift <= SAME_PLACE && turn <= SAME_TURN && scale <= SAME_SCALE
-    })
+    place(kept, id).is_some_and(|(at, depth)| seen_again::is_same(at, depth, a, b))
 }
 
 /// Between two components any, else one that the poses do not have already.
@@ -295,35 +355,10 @@ fn is_needed(kept: &Kept, best: &Best) -> bool {
     if component(kept, best.link.older) != component(kept, best.link.newer) {
         return true;
     }
-    apart(
-        kept,
-        best.link.newer,
-        &best.correction,
-        &Similarity::IDENTITY,
-    )
-    .is_some_and(|[shift, turn, scale]| {
-        shift > SMALL_SHIFT || turn > SMALL_TURN || scale > SMALL_SCALE
-    })
-}
-
-/// Whether the way between both ends may have gathered so much drift.
-fn is_plausible(kept: &Kept, best: &Best, max_drift: f64) -> bool {
-    let (older, newer) = best.link.ends();
-    if component(kept, older) != component(kept, newer) {
-        return true;
-    }
-    let own = component(kept, newer);
-    let mut length = 0.0;
-    let mut last: Option<DVec3> = None;
-    for (view, _) in kept.range(older..=newer).map(|(_, k)| k) {
-        if Some(view.component) == own {
-            let centre = view.batch_from_cam.translation;
-            length += last.map_or(0.0, |l| l.distance(centre));
-            last = Some(centre);
-        }
-    }
-    let Some(centre) = last else { return false };
-    let shift = best.correction.transform_point(centre).distance(centre);
-    let turn = best.correction.angle();
-    shift <= max_drift * length && turn <= MAX_TURN && best.correction.scale.ln().abs() <= MAX_SCALE
+    let as_is = Similarity::IDENTITY;
+    place(kept, best.link.newer)
+        .map(|(at, depth)| pose_graph::apart(at, depth, &best.correction, &as_is))
+        .is_some_and(|[shift, turn, scale]| {
+            shift > SMALL_SHIFT || turn > SMALL_TURN || scale > SMALL_SCALE
+        })
 }

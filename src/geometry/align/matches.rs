@@ -8,7 +8,7 @@ use std::sync::Arc;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::loops::{Kept, MIN_GAP};
+use super::loops::Kept;
 use super::{Matched, Pair, Shot, depth_at};
 use crate::config::SfmParams;
 use crate::config::align::AlignParams;
@@ -16,6 +16,7 @@ use crate::frame::RgbImage;
 use crate::geometry::View;
 use crate::geometry::features::{Features, FeaturesError, Finder, working_picture, working_size};
 use crate::geometry::matching::{Comparable, matches};
+use crate::geometry::seen_again::MIN_GAP;
 use crate::geometry::two_view::motion;
 
 /// Matches that a pair needs; fewer are as likely chance.
@@ -30,6 +31,10 @@ const GRID: usize = 12;
 const MAX_COVISIBLE: usize = 8;
 /// Keyframes whose features are remembered, at least.
 const MIN_HELD: usize = 64;
+/// Where rough poses and depth put a feature, it is found within this share of the longer side, and its depth within this
+/// logarithm: poses of one window are off by a degree or two, and those of neighbouring ones hardly more.
+const NEAR_SHARE: f64 = 0.15;
+const NEAR_DEPTH: f64 = 0.2;
 /// Longer side of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
 /// The focal length that verification rests on is the network's, so it is laxer than with a calibrated camera.
@@ -162,7 +167,12 @@ impl Matcher {
             .par_iter()
             .map(|&(a, b)| {
                 let (a, b) = if id(a) < id(b) { (a, b) } else { (b, a) };
-                let found = self.verified([&views[a], &views[b]], max_matches);
+                let both = [&views[a], &views[b]];
+                let found = if id(a).abs_diff(id(b)) <= MIN_GAP {
+                    self.near(both, max_matches)
+                } else {
+                    self.verified(both, max_matches)
+                };
                 ((id(a), id(b)), found)
             })
             .collect();
@@ -236,13 +246,47 @@ impl Matcher {
     }
 
     /// Matches of two views, the one with the lower id first, that agree with one rigid scene.
-    pub(super) fn verified(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
+    pub(super) fn verified(&self, both: [&View; 2], max_matches: usize) -> Numbers {
+        self.agreeing(both, max_matches, &|_, _| true)
+    }
+
+    /// The same of views whose rough poses count: where surfaces look alike, a match may be of another one.
+    fn near(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
+        let lens = |view: &View| self.shot(view).lens;
+        let lenses = [lens(a), lens(b)];
+        let b_from_a = b.batch_from_cam.inverse() * a.batch_from_cam;
+        let reach = NEAR_SHARE * f64::from(lenses[1].width_px.max(lenses[1].height_px));
+        self.agreeing([a, b], max_matches, &|at_a, at_b| {
+            let Some(depth) = depth_at(&a.depth, &lenses[0], at_a) else {
+                return true;
+            };
+            let point = b_from_a.transform_point(lenses[0].ray_in_cam(at_a) * depth);
+            let is_close = lenses[1]
+                .project(point)
+                .is_some_and(|p| p.distance(at_b) <= reach);
+            let found = depth_at(&b.depth, &lenses[1], at_b);
+            is_close && found.is_none_or(|z| (z / point.z).ln().abs() <= NEAR_DEPTH)
+        })
+    }
+
+    fn agreeing(
+        &self,
+        [a, b]: [&View; 2],
+        max_matches: usize,
+        may_match: &dyn Fn(DVec2, DVec2) -> bool,
+    ) -> Numbers {
         let (Some(first), Some(second)) =
             (self.held.get(&a.keyframe_id), self.held.get(&b.keyframe_id))
         else {
             return Vec::new();
         };
         let mut raw = matches(&first.comparable, &second.comparable);
+        raw.retain(|&(i, j)| {
+            may_match(
+                first.features.pixels[i as usize],
+                second.features.pixels[j as usize],
+            )
+        });
         raw.truncate(max_matches);
         if raw.len() < MIN_PAIR {
             return Vec::new();

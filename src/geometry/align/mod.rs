@@ -32,6 +32,7 @@ use self::tracks::{points, tracks};
 use self::whole::Whole;
 use self::window::{Joined, Windows};
 use crate::camera::Intrinsics;
+use crate::clock::Stamp;
 use crate::config::SfmParams;
 use crate::config::align::{AlignMethod, AlignParams};
 use crate::frame::{DepthMap, RgbImage};
@@ -112,6 +113,13 @@ impl Aligner {
             windows: Windows::new(params),
             whole: Whole::default(),
         })
+    }
+
+    /// When keyframes were taken: between components, that bounds how far the camera went.
+    pub fn note_stamps(&mut self, stamps: impl Iterator<Item = (u32, Stamp)>) {
+        if self.params.whole > 0 {
+            self.whole.loops.note_stamps(stamps);
+        }
     }
 
     /// The views of one window, in the network's own frame and unit -> in the running frame of their component.

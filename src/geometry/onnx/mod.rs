@@ -218,6 +218,8 @@ impl Foundation {
             .map(|k| (k.id, Arc::clone(&k.frame.image)))
             .collect();
         let views = window.into_iter().map(Seen::view).collect();
+        let stamps = keyframes.iter().map(|k| (k.id, k.frame.stamp));
+        self.aligner.note_stamps(stamps);
         let mut joined = self.aligner.place(views, &pictures, is_calibrated);
         tracing::debug!(fit = ?joined.fit, refined = ?joined.refined, "window");
         if joined.fit.is_none() && !self.placed.is_empty() {

@@ -1,8 +1,7 @@
 //! Links to shots long before -> used where they fit, a loop that is closed where they agree on one, else dropped.
 //!
-//! The gates are those of `align::loops`: neighbours say the same, no other place fits as well, and the way between may
-//! have drifted so far. A closed loop bends the way by a graph of poses, joins landmarks and adjusts all; if that loses
-//! sights, it was none and all is put back.
+//! The gates are those of `geometry::seen_again`. A closed loop bends the way by a graph of poses, joins landmarks and
+//! adjusts all; if that loses sights, it was none and all is put back.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,7 +14,8 @@ use super::links::{pair_seed, release};
 use super::merging::similarity;
 use super::scene::{Component, Landmark, Link, NONE, Placed, Scene, Shot};
 use crate::camera::Intrinsics;
-use crate::geometry::pose_graph::{Graph, Tie, apart};
+use crate::geometry::pose_graph::{Graph, Tie};
+use crate::geometry::seen_again::{self, MIN_GAP, MIN_LINKS, RIVAL};
 use crate::geometry::two_view::median;
 use crate::pose::{Rigid, Similarity};
 
@@ -24,19 +24,6 @@ const MIN_NAMED: usize = 15;
 const MIN_FITTING: f64 = 0.5;
 /// Shots that a link may wait for others that say the same.
 const MAX_WAIT: usize = 24;
-/// Shots in between from which on a place is seen again.
-const MIN_GAP: usize = 20;
-const MIN_LINKS: usize = 2;
-/// What links may differ in: share of the depth, radians, logarithm of scale.
-const SAME: [f64; 3] = [0.2, 0.07, 0.15];
-const RIVAL: f64 = 0.6;
-/// Of a way's drift: turn in radians, logarithm of scale.
-const MAX_TURN: f64 = 0.35;
-const MAX_SCALE: f64 = 0.3;
-/// Steps of the graph of poses, shots that each is tied to, and standard deviations that links must fit within.
-const MAX_STEPS: usize = 60;
-const N_TIED: usize = 2;
-const MAX_MISFIT: f64 = 4.0;
 /// Landmarks are joined within so many times the error of an inlier, before all is adjusted.
 const LAX_JOIN: f64 = 6.0;
 /// Of the sights before, so many must be left.
@@ -82,7 +69,7 @@ pub(super) fn settle(scene: &mut Scene, limits: &Limits, max_drift: Option<f64>)
         .into_iter()
         .for_each(|shot| adjust_local(scene, shot, limits));
     // Where one far place fits as the poses are, another that asks for a correction only looks alike.
-    let far = used.iter().filter(|e| e.0 + MIN_GAP <= e.1);
+    let far = used.iter().filter(|e| e.0 + MIN_GAP as usize <= e.1);
     let settled: BTreeSet<usize> = far.map(|e| e.1).collect();
     let (mut found, mut is_closed) = (Vec::new(), false);
     if let Some(max_drift) = max_drift {
@@ -148,23 +135,10 @@ fn is_plausible(scene: &Scene, candidate: &Candidate, max_drift: f64) -> bool {
         .filter(|&s| scene.component_of(s) == component)
         .filter_map(|s| scene.centre(s))
         .collect();
-    let length: f64 = way.windows(2).map(|two| two[0].distance(two[1])).sum();
-    let Some(centre) = way.last() else {
-        return false;
-    };
-    let correction = &candidate.correction;
-    let shift = correction.transform_point(*centre).distance(*centre);
-    tracing::debug!(
-        older,
-        newer,
-        shift,
-        length,
-        n = candidate.pairs.len(),
-        "seen again"
-    );
-    shift <= max_drift * length
-        && correction.angle() <= MAX_TURN
-        && correction.scale.ln().abs() <= MAX_SCALE
+    let is_plausible = seen_again::may_have_drifted(&way, &candidate.correction, max_drift);
+    let n = candidate.pairs.len();
+    tracing::debug!(older, newer, n, is_plausible, "seen again");
+    is_plausible
 }
 
 /// Links that say the same as the one with most landmarks, if they are enough and no other speaks against it; one that no
@@ -178,8 +152,7 @@ fn agreeing<'a>(
         let (Some(centre), depth) = (scene.centre(c.ends.1), depth(scene, c.ends.1)) else {
             return false;
         };
-        let apart = apart(centre, depth, &c.correction, &best.correction);
-        apart.iter().zip(SAME).all(|(off, limit)| *off <= limit)
+        seen_again::is_same(centre, depth, &c.correction, &best.correction)
     };
     let all: Vec<&Candidate> = found.iter().filter(is_same).collect();
     let rivals = found.iter().filter(|c| !is_same(c));
@@ -262,11 +235,8 @@ fn bend(scene: &mut Scene, component: u32, links: &[&Candidate]) -> bool {
     };
     let before: Vec<Similarity> = shots.iter().map(|s| pose(s).into()).collect();
     let depths: Vec<f64> = shots.iter().map(|s| depth(scene, *s)).collect();
-    let mut ties = Vec::new();
-    for (second, depth) in depths.iter().enumerate() {
-        let near = second.saturating_sub(N_TIED)..second;
-        ties.extend(near.map(|first| Tie::as_is(&before, (first, second), *depth)));
-    }
+    let way: Vec<usize> = (0..shots.len()).collect();
+    let mut ties = Tie::along(&way, &before, |ix| depths[ix]);
     let ix = |(a, b): (usize, usize)| Some((*ix_of.get(&a)?, *ix_of.get(&b)?));
     let closed = scene.closed.iter().filter_map(|ends| ix(*ends));
     ties.extend(closed.map(|ends| Tie::as_is(&before, ends, depths[ends.1])));
@@ -283,10 +253,7 @@ fn bend(scene: &mut Scene, component: u32, links: &[&Candidate]) -> bool {
         ties,
         moves_scale: true,
     };
-    let relaxed = graph.relax(MAX_STEPS);
-    let misfit = graph.mean_misfit();
-    tracing::debug!(?relaxed, misfit, "graph");
-    if misfit.is_nan() || misfit > MAX_MISFIT || !graph.nodes.iter().all(Similarity::is_finite) {
+    if !graph.spread() {
         return false;
     }
     for landmark in scene.landmarks_of(&shots) {
