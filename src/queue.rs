@@ -117,7 +117,30 @@ impl<T> Sender<T> {
     }
 }
 
+/// Ends a queue from a third side, while its receiver is busy elsewhere.
+#[derive(Debug)]
+pub struct Closer<T> {
+    shared: Arc<Shared<T>>,
+}
+
+impl<T> Closer<T> {
+    /// As if the receiver were gone: a sender that waits gets its item back. What lies in the queue is thrown away.
+    pub fn close(&self) {
+        let mut state = self.shared.lock();
+        state.receiver_is_alive = false;
+        state.items.clear();
+        drop(state);
+        self.shared.changed.notify_all();
+    }
+}
+
 impl<T> Receiver<T> {
+    pub fn closer(&self) -> Closer<T> {
+        Closer {
+            shared: Arc::clone(&self.shared),
+        }
+    }
+
     /// Waits for an item; `None` once the sender is gone and the queue is empty.
     pub fn recv(&self) -> Option<T> {
         let mut state = self.shared.lock();

@@ -168,6 +168,10 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     if let Some(error) = &outcome.error {
         anyhow::bail!("{error}: {input}");
     }
+    if outcome.was_stopped && outcome.snapshot.splats.is_empty() {
+        tracing::warn!("stopped before there was a map");
+        return Ok(ExitCode::SUCCESS);
+    }
     if !outcome.snapshot.poses.is_empty() && outcome.snapshot.splats.is_empty() {
         anyhow::bail!(
             "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",

@@ -140,6 +140,8 @@ pub struct Outcome {
     pub geometry_note: Option<String>,
     /// The stage that failed, and how; what was gathered before is kept.
     pub error: Option<String>,
+    /// Somebody asked for the end.
+    pub was_stopped: bool,
     /// Stays up for late joiners until `linger` has closed it.
     pub outbox: Option<Arc<Outbox>>,
     clerk: Clerk,

@@ -37,7 +37,7 @@ pub(super) type Outgoing = (Arc<Snapshot>, bool);
 
 /// Says what goes wrong, but not with every message.
 #[derive(Debug, Default)]
-struct Complaints {
+pub(super) struct Complaints {
     since: Option<Stopwatch>,
 }
 
@@ -89,15 +89,14 @@ pub(super) fn run_publisher(outbox: Option<&Outbox>, snapshots: &Receiver<Outgoi
 }
 
 /// In sequence: all that has come up.
-pub(super) fn say_all(outbox: &Outbox, events: &[LiveEvent]) {
-    let mut complaints = Complaints::default();
+pub(super) fn say_all(outbox: &Outbox, events: &[LiveEvent], complaints: &mut Complaints) {
     events
         .iter()
         .for_each(|event| complaints.of(say(outbox, event)));
 }
 
-pub(super) fn publish_or_say(outbox: &Outbox, outgoing: &Outgoing) {
-    Complaints::default().of(publish(outbox, outgoing));
+pub(super) fn publish_or_say(outbox: &Outbox, outgoing: &Outgoing, complaints: &mut Complaints) {
+    complaints.of(publish(outbox, outgoing));
 }
 
 fn publish(outbox: &Outbox, (snapshot, is_last): &Outgoing) -> Result<(), PublishError> {

@@ -1,19 +1,19 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
-use std::sync::Arc;
 use std::sync::mpsc::Receiver as Calls;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::clock::Stopwatch;
 use crate::frame::Batch;
-use crate::geometry::GeometryError;
-use crate::map::snapshot::Snapshot;
+use crate::geometry::{GeometryError, GeometryModel};
+use crate::map::snapshot::{Scale, Snapshot};
 use crate::node::opening;
-use crate::node::outward::{self, run_live, run_publisher};
+use crate::node::outward::{self, Complaints, run_live, run_publisher};
 use crate::node::source_stage::SourceStage;
-use crate::node::stages::{GeometryStage, MapStage, SelectStage};
+use crate::node::stages::{GeometryStage, GeometryTally, MapStage, SelectStage};
 use crate::node::threads::{Answer, joined, run_geometry, run_select, run_source};
-use crate::node::track_stage::{News, TrackStage, Tracking, policies, run_track};
+use crate::node::track_stage::{News, TrackStage, Tracking, run_track};
 use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::publish::outbox::Outbox;
 use crate::publish::service::Call;
@@ -40,7 +40,7 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
         let (is_live, out) = (job.is_live, job.out.clone());
         let mut ended = run_once(job, calls.take(), on_progress)?;
         if !stop.takes_restart() {
-            let mut outcome = ended.into_outcome(outbox);
+            let mut outcome = ended.into_outcome(outbox, stop.is_asked());
             outcome.secs.wall = watch.secs();
             return Ok(outcome);
         }
@@ -64,6 +64,16 @@ fn run_once(
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
+    run_with(model, scale, job, calls, on_progress)
+}
+
+fn run_with(
+    model: Box<dyn GeometryModel>,
+    scale: Scale,
+    job: Job,
+    calls: Option<Calls<Call>>,
+    on_progress: &mut dyn FnMut(Progress),
+) -> anyhow::Result<End> {
     let opening::Opened {
         map,
         track,
@@ -99,7 +109,7 @@ struct End {
     source: SourceStage,
     n_dropped: u64,
     select: SelectStage,
-    geometry: GeometryStage,
+    geometry: GeometryTally,
     map: MapStage,
     tracking: Tracking,
     snapshot: Arc<Snapshot>,
@@ -110,16 +120,17 @@ impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
         let outbox = self.outbox;
+        let (mut of_map, mut of_live) = (Complaints::default(), Complaints::default());
         let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
             if let Some(outbox) = &outbox {
-                outward::publish_or_say(outbox, &(snapshot, progress.has_ended));
+                outward::publish_or_say(outbox, &(snapshot, progress.has_ended), &mut of_map);
             }
             on_progress(progress);
         };
-        let tell = |track: &mut TrackStage| {
+        let mut tell = |track: &mut TrackStage| {
             let events = track.take_events();
             if let Some(outbox) = &outbox {
-                outward::say_all(outbox, &events);
+                outward::say_all(outbox, &events, &mut of_live);
             }
         };
         let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
@@ -161,7 +172,7 @@ impl Stages {
             source: self.source,
             n_dropped: 0,
             select: self.select,
-            geometry: self.geometry,
+            geometry: told(&self.geometry.tally()),
             map: self.map,
             snapshot,
             error: result.err().map(|e| format!("geometry: {e}")),
@@ -182,12 +193,12 @@ impl Stages {
         let (frames_tx, frames) = queue("frames", FRAME_QUEUE, when_full);
         let (batches_tx, batches) = queue("batches", 1, WhenFull::Wait);
         let (answers_tx, answers) = queue("answers", 1, WhenFull::Wait);
+        let (batches_end, tally) = (batches.closer(), self.geometry.tally());
         let (snapshots_tx, snapshots) = queue("snapshots", 1, WhenFull::DropOldest);
         let (progress_tx, progress) = queue("progress", 1, WhenFull::DropOldest);
 
-        let (heard_policy, news_policy) = policies(is_live);
-        let (heard_tx, heard) = queue("heard", HEARD_QUEUE, heard_policy);
-        let (news_tx, news) = queue("news", 1, news_policy);
+        let (heard_tx, heard) = queue("heard", HEARD_QUEUE, when_full);
+        let (news_tx, news) = queue("news", 1, when_full);
         // Live, the tracker must not wait for selection; in a replay, selection says what it has to wait for.
         let heard_tx = self.track.is_on().then_some(heard_tx);
         let news_tx = self.track.is_on().then_some(news_tx);
@@ -198,10 +209,9 @@ impl Stages {
         };
 
         let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
-        let live = match self.outbox.clone() {
-            Some(outbox) => Some(spawn("live", move || run_live(&outbox, &events))?),
-            None => None,
-        };
+        let outbox = self.outbox.clone();
+        let live = outbox.map(|outbox| spawn("live", move || run_live(&outbox, &events)));
+        let live = live.transpose()?;
         let track = spawn("track", move || {
             run_track(self.track, &heard, &news, &events_tx)
         })?;
@@ -236,21 +246,26 @@ impl Stages {
         while let Some(progress) = progress.recv() {
             on_progress(progress);
         }
+        let (map, snapshot, ending) = joined("map", map)?;
+        let error = match ending {
+            Ending::All => joined("geometry", geometry)?,
+            // Its thread ends with its batch, or with the process.
+            Ending::GivenUp => {
+                batches_end.close();
+                None
+            }
+        };
         let (source, n_dropped) = joined("source", source)?;
         let select = joined("select", select)?;
-        let (geometry, error) = joined("geometry", geometry)?;
-        let (map, snapshot) = joined("map", map)?;
         joined("publish", publisher)?;
         let tracking = joined("track", track)?;
-        if let Some(live) = live {
-            joined("live", live)?;
-        }
+        live.map(|live| joined("live", live)).transpose()?;
         Ok(End {
             tracking,
             source,
             n_dropped,
             select,
-            geometry,
+            geometry: told(&tally),
             map,
             snapshot,
             error: error.map(|e| format!("geometry: {e}")),
@@ -258,8 +273,20 @@ impl Stages {
     }
 }
 
+fn told(tally: &Mutex<GeometryTally>) -> GeometryTally {
+    tally.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+/// How the answers of geometry ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Ending {
+    All,
+    /// A stop was asked for, and geometry took too long to end.
+    GivenUp,
+}
+
 impl End {
-    fn into_outcome(self, outbox: Option<Arc<Outbox>>) -> Outcome {
+    fn into_outcome(self, outbox: Option<Arc<Outbox>>, was_stopped: bool) -> Outcome {
         let fault = self.map.map.fault().map(|fault| format!("engine: {fault}"));
         Outcome {
             snapshot: self.snapshot,
@@ -282,6 +309,7 @@ impl End {
             map: self.map.map,
             geometry_note: self.geometry.note,
             error: self.error.or(fault),
+            was_stopped,
             outbox,
         }
     }
@@ -292,12 +320,12 @@ fn run_map(
     (is_live, news): (bool, Option<&Sender<News>>),
     answers: &Receiver<Answer>,
     publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
-) -> (MapStage, Arc<Snapshot>) {
+) -> (MapStage, Arc<Snapshot>, Ending) {
     let mut since_news = Stopwatch::start();
-    loop {
+    let ending = loop {
         let answer = if is_live {
             match answers.try_recv() {
-                Ok(Some(answer)) => Some(answer),
+                Ok(Some(answer)) => Ok(answer),
                 Ok(None) if stage.step_while_waiting(publish) => {
                     if since_news.secs() > NEWS_SECS {
                         send_news(&mut stage, news);
@@ -306,29 +334,36 @@ fn run_map(
                     continue;
                 }
                 Ok(None) => next_answer(&mut stage, answers),
-                Err(Ended) => None,
+                Err(Ended) => Err(Ending::All),
             }
         } else {
             next_answer(&mut stage, answers)
         };
-        let Some((batch, geometry)) = answer else {
-            break;
+        let (batch, geometry) = match answer {
+            Ok(answer) => answer,
+            Err(ending) => break ending,
         };
         stage.add(batch.as_deref(), geometry, publish);
         send_news(&mut stage, news);
-    }
+    };
     let snapshot = stage.finish(publish);
     send_news(&mut stage, news);
-    (stage, snapshot)
+    (stage, snapshot, ending)
 }
 
 /// Waits, and serves calls from outside meanwhile.
-fn next_answer(stage: &mut MapStage, answers: &Receiver<Answer>) -> Option<Answer> {
+fn next_answer(stage: &mut MapStage, answers: &Receiver<Answer>) -> Result<Answer, Ending> {
     loop {
         match answers.recv_timeout(CALL_TICK) {
-            Received::Item(answer) => return Some(answer),
+            Received::Item(answer) => return Ok(answer),
+            Received::Nothing if stage.gives_up() => {
+                tracing::warn!(
+                    "stopped while geometry was at work: its last keyframes are not in the map"
+                );
+                return Err(Ending::GivenUp);
+            }
             Received::Nothing => stage.serve(),
-            Received::Ended => return None,
+            Received::Ended => return Err(Ending::All),
         }
     }
 }
@@ -339,3 +374,6 @@ fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
         drop(news.send(stage.map.keyframe_views()));
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -36,6 +36,8 @@ use crate::splat::Rendering;
 
 /// Training views whose quality is measured: enough for a mean, few enough for long recordings.
 const MAX_TRAIN_VIEWS: usize = 24;
+/// The same of each kind after a stop, which nobody wants to wait for.
+const MAX_VIEWS_STOPPED: usize = 6;
 /// Pictures in the report.
 const MAX_HELD_OUT_PICTURES: usize = 8;
 const MAX_TRAIN_PICTURES: usize = 4;
@@ -235,8 +237,17 @@ fn measure_quality(
             train.into_iter().map(|k| k.0).collect(),
         )
     };
-    let stride = train.len().div_ceil(MAX_TRAIN_VIEWS).max(1);
-    let train: Vec<u32> = train.into_iter().step_by(stride).collect();
+    let (most_held_out, most_train) = if outcome.was_stopped {
+        (MAX_VIEWS_STOPPED, MAX_VIEWS_STOPPED)
+    } else {
+        (usize::MAX, MAX_TRAIN_VIEWS)
+    };
+    let n_held_out = held_out.len();
+    let (held_out, train) = (thinned(held_out, most_held_out), thinned(train, most_train));
+    if held_out.len() < n_held_out {
+        let n = held_out.len();
+        tracing::info!("stopped: quality is that of {n} of {n_held_out} held-out views");
+    }
     let mut pictures = Vec::new();
     let mut measure = |ids: &[u32], is_held_out: bool, max_pictures: usize| {
         let picture_stride = ids.len().div_ceil(max_pictures).max(1);
@@ -277,6 +288,12 @@ fn measure_quality(
         lpips_holdout,
     };
     (quality, pictures)
+}
+
+/// Evenly, at most so many.
+fn thinned(ids: Vec<u32>, most: usize) -> Vec<u32> {
+    let stride = ids.len().div_ceil(most).max(1);
+    ids.into_iter().step_by(stride).collect()
 }
 
 /// A network that fails is not asked again: the run is worth more than this figure.

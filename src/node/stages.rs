@@ -1,7 +1,7 @@
 //! The stages between the queues: each is a struct with push-like methods and knows no threads.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
@@ -21,6 +21,8 @@ use crate::select::{Batcher, Selector};
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
+/// Seconds that geometry gets to end after a stop.
+const SECS_AFTER_STOP: f64 = 0.7;
 /// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
 const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 
@@ -37,6 +39,12 @@ pub(super) struct SelectStage {
 /// Batches -> geometry.
 pub(super) struct GeometryStage {
     model: Box<dyn GeometryModel>,
+    tally: Arc<Mutex<GeometryTally>>,
+}
+
+/// What geometry leaves behind, even where it was given up at a batch.
+#[derive(Debug, Clone, Default)]
+pub(super) struct GeometryTally {
     pub(super) secs: f64,
     pub(super) note: Option<String>,
 }
@@ -54,6 +62,8 @@ pub(super) struct MapStage {
     unpublished: BTreeMap<u32, Stopwatch>,
     pub(super) autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
+    /// Since a stop was noticed.
+    since_stop: Option<Stopwatch>,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
     pub(super) keyframe_to_pose_secs: Vec<f64>,
@@ -92,9 +102,12 @@ impl GeometryStage {
     pub(super) fn new(model: Box<dyn GeometryModel>) -> Self {
         Self {
             model,
-            secs: 0.0,
-            note: None,
+            tally: Arc::default(),
         }
+    }
+
+    pub(super) fn tally(&self) -> Arc<Mutex<GeometryTally>> {
+        Arc::clone(&self.tally)
     }
 
     pub(super) fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
@@ -110,11 +123,12 @@ impl GeometryStage {
     }
 
     fn account(
-        &mut self,
+        &self,
         watch: &Stopwatch,
         geometry: Result<GeometryBatch, GeometryError>,
     ) -> Result<GeometryBatch, GeometryError> {
-        self.secs += watch.secs();
+        let mut tally = self.tally.lock().unwrap_or_else(PoisonError::into_inner);
+        tally.secs += watch.secs();
         if let Ok(geometry) = &geometry {
             tracing::info!(
                 "batch {}: {} views, {} revised{}",
@@ -127,7 +141,7 @@ impl GeometryStage {
                     .map(|n| format!(", {n}"))
                     .unwrap_or_default()
             );
-            self.note = geometry.note.clone().or(self.note.take());
+            tally.note = geometry.note.clone().or(tally.note.take());
         }
         geometry
     }
@@ -153,6 +167,7 @@ impl MapStage {
             unpublished: BTreeMap::new(),
             autosave: None,
             since_snapshot: Stopwatch::start(),
+            since_stop: None,
             n_keyframes: 0,
             optimise_secs: 0.0,
             keyframe_to_pose_secs: Vec::new(),
@@ -242,6 +257,15 @@ impl MapStage {
     /// Calls from outside, while nothing else is to be done.
     pub(super) fn serve(&mut self) {
         self.clerk.serve(&mut self.map);
+    }
+
+    /// After a stop, geometry gets a moment for the batch that it is at, and no more: a network can take minutes.
+    pub(super) fn gives_up(&mut self) -> bool {
+        if self.since_stop.is_none() && self.stop.is_asked() {
+            self.since_stop = Some(Stopwatch::start());
+        }
+        self.since_stop
+            .is_some_and(|watch| watch.secs() > SECS_AFTER_STOP)
     }
 
     /// Writes the map's part of the status.

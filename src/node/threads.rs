@@ -60,23 +60,23 @@ pub(super) fn run_geometry(
     mut stage: GeometryStage,
     batches: &Receiver<Arc<Batch>>,
     answers: &Sender<Answer>,
-) -> (GeometryStage, Option<GeometryError>) {
+) -> Option<GeometryError> {
     while let Some(batch) = batches.recv() {
         match stage.infer(&batch) {
             Ok(geometry) => {
                 if answers.send((Some(batch), geometry)).is_err() {
-                    return (stage, None);
+                    return None;
                 }
             }
-            Err(error) => return (stage, Some(error)),
+            Err(error) => return Some(error),
         }
     }
     match stage.finish() {
         Ok(geometry) => {
             drop(answers.send((None, geometry)));
-            (stage, None)
+            None
         }
-        Err(error) => (stage, Some(error)),
+        Err(error) => Some(error),
     }
 }
 

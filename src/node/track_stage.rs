@@ -10,7 +10,7 @@ use crate::pose::Rigid;
 use crate::pose::Similarity;
 use crate::publish::overview::SeenKeyframe;
 use crate::publish::world::LiveFrame;
-use crate::queue::{Receiver, Sender, WhenFull};
+use crate::queue::{Receiver, Sender};
 use crate::track::{KeyframeView, State, TrackedFrame, Tracker, Tracks};
 
 /// Times that the figures of a run are made from: those of the last two hours at 15 Hz.
@@ -251,15 +251,6 @@ fn note(times: &mut VecDeque<f64>, secs: f64) {
         times.pop_front();
     }
     times.push_back(secs);
-}
-
-/// Queue policies of (what is heard, news of the map).
-pub(super) fn policies(is_live: bool) -> (WhenFull, WhenFull) {
-    if is_live {
-        (WhenFull::DropOldest, WhenFull::DropOldest)
-    } else {
-        (WhenFull::Wait, WhenFull::Wait)
-    }
 }
 
 /// Sends a frame to the tracker, if there is one; the picture is shared.
