@@ -132,6 +132,15 @@ pub struct Header {
     pub frame_id: String,
 }
 
+impl Header {
+    pub fn new(stamp: Stamp, frame: &str) -> Self {
+        Self {
+            stamp: stamp.into(),
+            frame_id: frame.to_owned(),
+        }
+    }
+}
+
 /// `sensor_msgs/msg/Image`; rows top to bottom, `step` bytes each.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Image {

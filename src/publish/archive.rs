@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use crate::map::layout;
 use crate::map::snapshot::Snapshot;
 use crate::publish::PublishError;
 use crate::publish::face::{Delivery, Post, Topic};
@@ -15,11 +16,18 @@ pub static SPLATS: Topic = Topic::of::<SplatChunk>("splats", Delivery::Reliable 
 pub static MANIFEST: Topic =
     Topic::of::<SplatManifest>("splats/manifest", Delivery::Latched { depth: 1 });
 
+/// The published map, with the digest of its splats: that takes a pass over all of them.
+#[derive(Debug, Clone)]
+pub struct PublishedMap {
+    pub snapshot: Arc<Snapshot>,
+    map_sha256: [u8; 32],
+}
+
 #[derive(Debug, Default)]
 struct Kept {
     /// By topic, unless they are pieces of the map.
     newest: BTreeMap<&'static str, Post>,
-    map: Option<Arc<Snapshot>>,
+    map: Option<PublishedMap>,
 }
 
 /// Shared by all faces and services.
@@ -47,12 +55,16 @@ impl Archive {
         self.kept().newest.insert(post.topic.name, post.clone());
     }
 
-    pub(super) fn keep_map(&self, map: &Arc<Snapshot>) {
-        self.kept().map = Some(Arc::clone(map));
+    pub(super) fn keep_map(&self, snapshot: &Arc<Snapshot>) -> PublishedMap {
+        let map = PublishedMap {
+            snapshot: Arc::clone(snapshot),
+            map_sha256: layout::digest(&snapshot.splats),
+        };
+        self.kept().map = Some(map.clone());
+        map
     }
 
-    /// The published map.
-    pub fn map(&self) -> Option<Arc<Snapshot>> {
+    pub fn map(&self) -> Option<PublishedMap> {
         self.kept().map.clone()
     }
 
@@ -61,8 +73,9 @@ impl Archive {
     }
 
     /// A map cut into messages.
-    pub fn messages<'a>(&'a self, map: &'a Snapshot) -> Messages<'a> {
-        Messages::new(map, &self.splat_frame, self.chunk_bytes)
+    pub fn messages<'a>(&'a self, map: &'a PublishedMap) -> Messages<'a> {
+        let (frame, chunk_bytes) = (&self.splat_frame, self.chunk_bytes);
+        Messages::of_known(&map.snapshot, map.map_sha256, frame, chunk_bytes)
     }
 
     /// Hands what a late joiner of a topic should have to `send`, until that fails.
@@ -81,16 +94,16 @@ impl Archive {
         let Some(map) = self.map() else {
             return Ok(());
         };
-        let messages = self.messages(&map);
+        let (messages, stamp) = (self.messages(&map), map.snapshot.stamp);
         if topic.name == MANIFEST.name {
-            send(&Post::of(&MANIFEST, map.stamp, &messages.manifest())?)?;
+            send(&Post::of(&MANIFEST, stamp, &messages.manifest())?)?;
         } else if topic.name == KEYFRAMES.name {
             for array in messages.keyframes() {
-                send(&Post::of(&KEYFRAMES, map.stamp, &array)?)?;
+                send(&Post::of(&KEYFRAMES, stamp, &array)?)?;
             }
         } else {
             for chunk in messages.chunks() {
-                send(&Post::of(&SPLATS, map.stamp, &chunk)?)?;
+                send(&Post::of(&SPLATS, stamp, &chunk)?)?;
             }
         }
         Ok(())

@@ -91,10 +91,7 @@ pub fn correction(
         (is.translation.distance(was.translation), is.angle_to(was))
     });
     Some(MapCorrection {
-        header: Header {
-            stamp: new.stamp.into(),
-            frame_id: frame.to_owned(),
-        },
+        header: Header::new(new.stamp, frame),
         map_id: new.map_id,
         epoch: new.epoch,
         revision: new.revision,

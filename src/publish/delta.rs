@@ -8,9 +8,10 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::map::layout;
+use crate::map::seed::SH_C0;
 use crate::map::snapshot::Snapshot;
 use crate::publish::face::{Delivery, Topic};
-use crate::publish::wire::{MAX_MESSAGE_BYTES, splats_per_message};
+use crate::publish::wire::{MAX_MESSAGE_BYTES, Messages, splats_per_message};
 use crate::ros::{Header, Message};
 use crate::ros::{header_def, separator, time_def};
 use crate::splat::Splats;
@@ -18,8 +19,6 @@ use crate::splat::Splats;
 /// Change below it is not seen: in standard deviations of the splat, or steps of a 0 to 1 colour times two, each
 /// weighed by the splat's opacity.
 const MIN_CHANGE: f32 = 0.02;
-/// Degree-0 coefficient to colour.
-const SH_C0: f32 = 0.282_094_8;
 
 pub static DELTA: Topic = Topic::of::<SplatDelta>("splats/delta", Delivery::Reliable { depth: 64 });
 
@@ -210,14 +209,11 @@ fn change((old, i): (&Splats, usize), (new, j): (&Splats, usize)) -> f32 {
 }
 
 impl Delta {
-    /// The messages; `after` is the published map that the update has led to.
-    pub fn messages<'a>(
-        &'a self,
-        after: &'a Snapshot,
-        frame: &'a str,
-        chunk_bytes: usize,
-    ) -> impl Iterator<Item = SplatDelta> + 'a {
-        let chunk_bytes = chunk_bytes.min(MAX_MESSAGE_BYTES / 4);
+    /// The messages; `after` are those of the published map that the update has led to.
+    pub fn messages<'a>(&'a self, after: &Messages<'a>) -> impl Iterator<Item = SplatDelta> + 'a {
+        let chunk_bytes = after.chunk_bytes.min(MAX_MESSAGE_BYTES / 4);
+        let (header, map_sha256) = (after.header(), after.map_sha256);
+        let after = after.snapshot;
         let per_piece = splats_per_message(&after.splats, chunk_bytes);
         let removed_per_piece = (chunk_bytes / 4).max(1);
         let n_pieces = self
@@ -226,21 +222,13 @@ impl Delta {
             .div_ceil(per_piece)
             .max(self.removed.len().div_ceil(removed_per_piece))
             .max(1);
-        let map_sha256 = layout::digest(&after.splats);
         (0..n_pieces).map(move |piece_ix| {
             let changed = piece(&self.changed, piece_ix, per_piece);
-            let mut some = Splats {
-                sh_degree: after.splats.sh_degree,
-                ..Splats::default()
-            };
-            changed.iter().for_each(|ix| some.push(&after.splats, *ix));
+            let some = after.splats.picked(changed);
             let mut data = Vec::new();
             layout::encode(&some, 0..some.len(), &mut data);
             SplatDelta {
-                header: Header {
-                    stamp: after.stamp.into(),
-                    frame_id: frame.to_owned(),
-                },
+                header: header.clone(),
                 map_id: after.map_id,
                 epoch: after.epoch,
                 revision: after.revision,

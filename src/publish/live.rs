@@ -33,7 +33,7 @@ impl LiveMessages {
 
     pub fn pose(&self, at: &Whereabouts) -> Result<Post, PublishError> {
         let message = PoseWithCovarianceStamped {
-            header: header(at.stamp, &self.params.map_frame),
+            header: Header::new(at.stamp, &self.params.map_frame),
             pose: PoseWithCovariance {
                 pose: at.map_from_base.into(),
                 covariance: halves(&at.covariance),
@@ -57,7 +57,7 @@ impl LiveMessages {
             std::array::from_fn(|i| std::array::from_fn(|j| if i == j { value(i) } else { 0.0 }))
         };
         let message = Odometry {
-            header: header(at.stamp, &self.params.odom_frame),
+            header: Header::new(at.stamp, &self.params.odom_frame),
             child_frame_id: self.params.base_frame.clone(),
             pose: PoseWithCovariance {
                 pose: at.odom_from_base.into(),
@@ -65,8 +65,8 @@ impl LiveMessages {
             },
             twist: TwistWithCovariance {
                 twist: Twist {
-                    linear: vector(linear),
-                    angular: vector(angular),
+                    linear: Vector3::from(linear),
+                    angular: Vector3::from(angular),
                 },
                 covariance: halves(&diagonal(&of_twist)),
             },
@@ -95,7 +95,7 @@ impl LiveMessages {
                 .saturating_add((params.tf_tolerance * 1e9) as i64),
         );
         let link = |stamp, parent: &str, child: &str, pose: Rigid| TransformStamped {
-            header: header(stamp, parent),
+            header: Header::new(stamp, parent),
             child_frame_id: child.to_owned(),
             transform: pose.into(),
         };
@@ -114,21 +114,6 @@ impl LiveMessages {
             ));
         }
         Post::of(&TF, stamp, &TfMessage { transforms }).map(Some)
-    }
-}
-
-fn header(stamp: Stamp, frame: &str) -> Header {
-    Header {
-        stamp: stamp.into(),
-        frame_id: frame.to_owned(),
-    }
-}
-
-fn vector(v: glam::DVec3) -> Vector3 {
-    Vector3 {
-        x: v.x,
-        y: v.y,
-        z: v.z,
     }
 }
 

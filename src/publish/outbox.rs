@@ -280,11 +280,11 @@ impl Outbox {
             .update(snapshot, is_whole, self.params.delta_share);
         let held = side.published.held().map_or(snapshot, |held| held);
         // Before the first message goes out: who subscribed too late for it finds it there.
-        self.archive.keep_map(held);
+        let kept = self.archive.keep_map(held);
         if let Some(moved) = moved {
             self.send(&Post::of(&CORRECTION, snapshot.stamp, &moved)?)?;
         }
-        let messages = self.archive.messages(held);
+        let messages = self.archive.messages(&kept);
         let stamp = held.stamp;
         if let Update::Whole = &update {
             self.send(&Post::of(&MANIFEST, stamp, &messages.manifest())?)?;
@@ -299,8 +299,7 @@ impl Outbox {
                 }
             }
             Update::Delta(delta) => {
-                let frame = self.archive.splat_frame();
-                for piece in delta.messages(held, frame, self.params.chunk_bytes) {
+                for piece in delta.messages(&messages) {
                     self.send(&Post::of(&DELTA, stamp, &piece)?)?;
                 }
             }

@@ -6,6 +6,7 @@ use crate::camera::Intrinsics;
 use crate::clock::Stamp;
 use crate::config::PublishParams;
 use crate::frame::{DepthMap, RgbImage};
+use crate::map::seed::SH_C0;
 use crate::map::snapshot::Snapshot;
 use crate::pose::Similarity;
 use crate::publish::face::{Delivery, Topic};
@@ -27,7 +28,6 @@ const MAX_KEYFRAME_POINTS: usize = 20_000;
 const MIN_LOGIT: f32 = 0.0;
 /// x y z rgb confidence.
 const POINT_BYTES: usize = 20;
-const SH_C0: f32 = 0.282_094_8;
 /// Depth of a frustum as a share of the cameras' spread.
 const FRUSTUM_SHARE: f64 = 0.05;
 
@@ -42,21 +42,6 @@ pub struct SeenKeyframe {
     pub depth: std::sync::Arc<DepthMap>,
 }
 
-fn header(stamp: Stamp, frame: &str) -> Header {
-    Header {
-        stamp: stamp.into(),
-        frame_id: frame.to_owned(),
-    }
-}
-
-fn vector(v: DVec3) -> Vector3 {
-    Vector3 {
-        x: v.x,
-        y: v.y,
-        z: v.z,
-    }
-}
-
 /// Refined cameras in the map frame, oldest first.
 pub fn path(snapshot: &Snapshot, map_from_splats: &Similarity, params: &PublishParams) -> Path {
     let every = snapshot.poses.len().div_ceil(MAX_POSES).max(1);
@@ -66,13 +51,13 @@ pub fn path(snapshot: &Snapshot, map_from_splats: &Similarity, params: &PublishP
         .rev()
         .step_by(every)
         .map(|pose| PoseStamped {
-            header: header(pose.stamp, &params.map_frame),
+            header: Header::new(pose.stamp, &params.map_frame),
             pose: map_from_splats.transform_pose(&pose.map_from_cam).into(),
         });
     let mut poses: Vec<PoseStamped> = poses.collect();
     poses.reverse();
     Path {
-        header: header(snapshot.stamp, &params.map_frame),
+        header: Header::new(snapshot.stamp, &params.map_frame),
         poses,
     }
 }
@@ -96,7 +81,7 @@ pub fn cloud(
         let rgb = [0, 1, 2].map(|c| (255.0 * (0.5 + SH_C0 * sh[c])).clamp(0.0, 255.0) as u8);
         (point, rgb, 1.0 / (1.0 + (-splats.opacity_logits[i]).exp()))
     });
-    cloud_of(header(snapshot.stamp, &params.map_frame), points)
+    cloud_of(Header::new(snapshot.stamp, &params.map_frame), points)
 }
 
 /// Verified depth of one keyframe in the camera's own frame: metres where they are known.
@@ -121,7 +106,7 @@ pub fn keyframe_cloud(seen: &SeenKeyframe, metres: f64, camera_frame: &str) -> P
         let rgb = [0, 1, 2].map(|c| image.pixels[pixel + c]);
         (DVec3::new(x, y, z), rgb, depth.confidence[i])
     });
-    cloud_of(header(seen.stamp, camera_frame), points)
+    cloud_of(Header::new(seen.stamp, camera_frame), points)
 }
 
 fn cloud_of(header: Header, points: impl Iterator<Item = (DVec3, [u8; 3], f32)>) -> PointCloud2 {
@@ -183,15 +168,15 @@ pub fn frusta(
         let (right, low) = (f64::from(k.width_px), f64::from(k.height_px));
         let corners = [(0.0, 0.0), (right, 0.0), (right, low), (0.0, low)].map(|(u, v)| {
             let ray = DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
-            vector(map_from_cam.transform_point(ray * depth))
+            Vector3::from(map_from_cam.transform_point(ray * depth))
         });
-        let tip = vector(map_from_cam.translation);
+        let tip = Vector3::from(map_from_cam.translation);
         for i in 0..4 {
             points.extend([tip, corners[i], corners[i], corners[(i + 1) % 4]]);
         }
     }
     let marker = Marker {
-        header: header(snapshot.stamp, &params.map_frame),
+        header: Header::new(snapshot.stamp, &params.map_frame),
         ns: "keyframes".to_owned(),
         kind: Marker::LINE_LIST,
         scale: Vector3 {

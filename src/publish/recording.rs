@@ -1,23 +1,24 @@
 //! Outgoing messages -> an MCAP file with their definitions, which Foxglove and `ros2 bag play` open.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use mcap::records::MessageHeader;
-
 use crate::publish::PublishError;
 use crate::publish::face::{Face, Post};
+use crate::source::bag_writer::{BagWriter, Topic, options};
 
 /// A node killed between chunks loses at most so much.
 const CHUNK_BYTES: u64 = 1 << 20;
+/// Of zstd: the mapping has better uses for a core.
+const COMPRESSION_LEVEL: u32 = 1;
 
 struct Open {
-    file: mcap::Writer<BufWriter<File>>,
-    /// Channel and number of the last message, by topic.
-    topics: BTreeMap<&'static str, (u16, u32)>,
+    file: BagWriter<BufWriter<File>>,
+    topics: BTreeMap<&'static str, Topic>,
 }
 
 /// One file; closed with the node.
@@ -40,11 +41,8 @@ impl RecordingFace {
             path: path.to_owned(),
         };
         let file = File::create(path).map_err(|e| fault(e.to_string()))?;
-        let file = mcap::WriteOptions::new()
-            .profile("ros2")
-            .chunk_size(Some(CHUNK_BYTES))
-            .create(BufWriter::new(file))
-            .map_err(|e| fault(e.to_string()))?;
+        let options = options(COMPRESSION_LEVEL).chunk_size(Some(CHUNK_BYTES));
+        let file = BagWriter::new(options, BufWriter::new(file)).map_err(fault)?;
         Ok(Self {
             path: path.to_owned(),
             open: Mutex::new(Some(Open {
@@ -54,44 +52,29 @@ impl RecordingFace {
         })
     }
 
-    fn fault(&self, e: &mcap::McapError) -> PublishError {
+    fn fault(&self, reason: String) -> PublishError {
         PublishError::Record {
-            reason: e.to_string(),
+            reason,
             path: self.path.clone(),
         }
     }
 }
 
 impl Open {
-    fn write(&mut self, post: &Post) -> mcap::McapResult<()> {
-        let topic = post.topic;
-        let (channel_id, sequence) = match self.topics.get(topic.name) {
-            Some(known) => *known,
-            None => {
-                let schema = self.file.add_schema(
-                    topic.type_name,
-                    "ros2msg",
-                    topic.definition.as_bytes(),
-                )?;
-                let name = match topic.name.strip_prefix('/') {
-                    Some(_) => topic.name.to_owned(),
-                    None => format!("/splat_mapper/{}", topic.name),
+    fn write(&mut self, post: &Post) -> Result<(), String> {
+        let of = post.topic;
+        let topic = match self.topics.entry(of.name) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => {
+                let name = match of.name.strip_prefix('/') {
+                    Some(_) => of.name.to_owned(),
+                    None => format!("/splat_mapper/{}", of.name),
                 };
-                let channel = self
-                    .file
-                    .add_channel(schema, &name, "cdr", &BTreeMap::new())?;
-                (channel, 0)
+                new.insert(self.file.topic_of(&name, of.type_name, of.definition)?)
             }
         };
-        self.topics.insert(topic.name, (channel_id, sequence + 1));
         let nanos = u64::try_from(post.stamp.nanos).unwrap_or(0);
-        let header = MessageHeader {
-            channel_id,
-            sequence,
-            log_time: nanos,
-            publish_time: nanos,
-        };
-        self.file.write_to_known_channel(&header, &post.payload)
+        self.file.write_payload(topic, nanos, &post.payload)
     }
 }
 
@@ -99,22 +82,15 @@ impl Face for RecordingFace {
     fn send(&self, post: &Post) -> Result<(), PublishError> {
         let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
         match open.as_mut() {
-            Some(open) => open.write(post).map_err(|e| self.fault(&e)),
+            Some(open) => open.write(post).map_err(|e| self.fault(e)),
             None => Ok(()),
         }
     }
 
     fn close(&self) -> Result<(), PublishError> {
-        let open = self
-            .open
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .take();
-        match open {
-            Some(mut open) => match open.file.finish() {
-                Ok(_) => Ok(()),
-                Err(e) => Err(self.fault(&e)),
-            },
+        let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
+        match open.take() {
+            Some(open) => open.file.finish().map(|_| ()).map_err(|e| self.fault(e)),
             None => Ok(()),
         }
     }

@@ -271,10 +271,12 @@ impl Desk {
         let response = match (decoded::<GetSplatsRequest>(question), self.archive.map()) {
             (Err(reason), _) => refused(reason),
             (_, None) => refused("there is no map yet".to_owned()),
-            (Ok(asked), Some(map)) if asked.revision != 0 && asked.revision != map.revision => {
+            (Ok(asked), Some(map))
+                if asked.revision != 0 && asked.revision != map.snapshot.revision =>
+            {
                 refused(format!(
                     "revision {} is gone, the newest is {}; begin again with it",
-                    asked.revision, map.revision
+                    asked.revision, map.snapshot.revision
                 ))
             }
             (Ok(asked), Some(map)) => {

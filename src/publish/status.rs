@@ -167,10 +167,7 @@ impl Standing {
     pub fn message(&self, frame: &str, rss_mib: Option<f64>, silent_secs: f64) -> MapperStatus {
         let (scale_source, metres_per_unit, scale_std) = self.scale.to_numbers();
         MapperStatus {
-            header: Header {
-                stamp: self.stamp.into(),
-                frame_id: frame.to_owned(),
-            },
+            header: Header::new(self.stamp, frame),
             map_id: self.map_id,
             epoch: self.epoch,
             revision: self.revision,

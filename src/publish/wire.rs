@@ -121,9 +121,10 @@ impl Message for KeyframeArray {
 /// A snapshot cut into messages. Chunks are made one at a time: the whole map need not be there twice.
 #[derive(Debug)]
 pub struct Messages<'a> {
-    snapshot: &'a Snapshot,
+    pub(super) snapshot: &'a Snapshot,
     frame: &'a str,
-    map_sha256: [u8; 32],
+    pub(super) map_sha256: [u8; 32],
+    pub(super) chunk_bytes: usize,
     splats_per_chunk: usize,
     keyframes_per_array: usize,
 }
@@ -131,11 +132,23 @@ pub struct Messages<'a> {
 impl<'a> Messages<'a> {
     /// A chunk holds at least one splat, however small `chunk_bytes` is. `frame` is the splats' own.
     pub fn new(snapshot: &'a Snapshot, frame: &'a str, chunk_bytes: usize) -> Self {
+        let map_sha256 = layout::digest(&snapshot.splats);
+        Self::of_known(snapshot, map_sha256, frame, chunk_bytes)
+    }
+
+    /// Where the splats' digest is known already.
+    pub(super) fn of_known(
+        snapshot: &'a Snapshot,
+        map_sha256: [u8; 32],
+        frame: &'a str,
+        chunk_bytes: usize,
+    ) -> Self {
         let chunk_bytes = chunk_bytes.min(MAX_MESSAGE_BYTES / 2);
         Self {
             snapshot,
             frame,
-            map_sha256: layout::digest(&snapshot.splats),
+            map_sha256,
+            chunk_bytes,
             splats_per_chunk: splats_per_message(&snapshot.splats, chunk_bytes),
             keyframes_per_array: (chunk_bytes / KEYFRAME_POSE_BYTES).max(1),
         }
@@ -220,11 +233,8 @@ impl<'a> Messages<'a> {
         self.snapshot.splats.len().div_ceil(self.splats_per_chunk)
     }
 
-    fn header(&self) -> Header {
-        Header {
-            stamp: self.snapshot.stamp.into(),
-            frame_id: self.frame.to_owned(),
-        }
+    pub(super) fn header(&self) -> Header {
+        Header::new(self.snapshot.stamp, self.frame)
     }
 }
 

@@ -5,15 +5,21 @@ use glam::{DQuat, DVec3};
 use super::{Pose, Quaternion, Vector3};
 use crate::pose::Rigid;
 
+impl From<DVec3> for Vector3 {
+    fn from(v: DVec3) -> Self {
+        Self {
+            x: v.x,
+            y: v.y,
+            z: v.z,
+        }
+    }
+}
+
 impl From<Rigid> for Pose {
     fn from(rigid: Rigid) -> Self {
         let (t, q) = (rigid.translation, rigid.rotation);
         Self {
-            position: Vector3 {
-                x: t.x,
-                y: t.y,
-                z: t.z,
-            },
+            position: t.into(),
             orientation: Quaternion {
                 x: q.x,
                 y: q.y,

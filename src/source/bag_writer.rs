@@ -48,9 +48,19 @@ impl<W: Write + Seek> BagWriter<W> {
     }
 
     pub fn topic<T: Message>(&mut self, name: &str) -> Result<Topic, String> {
+        self.topic_of(name, T::TYPE_NAME, T::DEFINITION)
+    }
+
+    /// `definition` in `ros2msg` form.
+    pub fn topic_of(
+        &mut self,
+        name: &str,
+        type_name: &str,
+        definition: &str,
+    ) -> Result<Topic, String> {
         let schema = self
             .file
-            .add_schema(T::TYPE_NAME, "ros2msg", T::DEFINITION.as_bytes());
+            .add_schema(type_name, "ros2msg", definition.as_bytes());
         let schema = schema.map_err(|e| e.to_string())?;
         let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), String::new())]);
         let channel_id = self
@@ -70,6 +80,16 @@ impl<W: Write + Seek> BagWriter<W> {
         message: &T,
     ) -> Result<(), String> {
         let payload = ros::encode(message).map_err(|e| e.to_string())?;
+        self.write_payload(topic, nanos, &payload)
+    }
+
+    /// A message that is CDR already.
+    pub fn write_payload(
+        &mut self,
+        topic: &mut Topic,
+        nanos: u64,
+        payload: &[u8],
+    ) -> Result<(), String> {
         let header = MessageHeader {
             channel_id: topic.channel_id,
             sequence: topic.sequence,
@@ -79,7 +99,7 @@ impl<W: Write + Seek> BagWriter<W> {
         topic.sequence = topic.sequence.wrapping_add(1);
         self.n_messages += 1;
         self.file
-            .write_to_known_channel(&header, &payload)
+            .write_to_known_channel(&header, payload)
             .map_err(|e| e.to_string())
     }
 

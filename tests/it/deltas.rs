@@ -35,7 +35,10 @@ fn whole(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
 fn pieces(update: &Update, held: &Snapshot) -> Vec<SplatDelta> {
     match update {
         Update::Whole => panic!("a whole snapshot where a delta was due"),
-        Update::Delta(delta) => delta.messages(held, FRAME, CHUNK_BYTES).collect(),
+        Update::Delta(delta) => {
+            let after = Messages::new(held, FRAME, CHUNK_BYTES);
+            delta.messages(&after).collect()
+        }
     }
 }
 

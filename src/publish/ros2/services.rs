@@ -7,6 +7,7 @@ use r2r::splat_mapper_msgs::srv::{Export, GetSplats, LoadMap, RenderView, SaveMa
 use r2r::std_srvs::srv::Trigger;
 use r2r::{QosProfile, ServiceRequest, WrappedServiceTypeSupport, WrappedTypesupport};
 
+use crate::publish::offered::{Kind, SERVICES};
 use crate::source::ros2::link::{Link, LinkError};
 
 /// Questions that wait for the thread that answers.
@@ -32,14 +33,19 @@ pub(super) fn clerk() -> Result<SyncSender<Job>, std::io::Error> {
 
 /// Offers the services of the mapper. The same desk serves all.
 pub(super) fn offer(link: &Link, desk: &Desk, jobs: &SyncSender<Job>) -> Result<(), LinkError> {
-    serve::<SaveMap::Service>(link, "save_map", desk, jobs)?;
-    serve::<LoadMap::Service>(link, "load_map", desk, jobs)?;
-    serve::<Export::Service>(link, "export", desk, jobs)?;
-    serve::<Trigger::Service>(link, "reset", desk, jobs)?;
-    serve::<Trigger::Service>(link, "pause", desk, jobs)?;
-    serve::<Trigger::Service>(link, "resume", desk, jobs)?;
-    serve::<GetSplats::Service>(link, "get_splats", desk, jobs)?;
-    serve::<RenderView::Service>(link, "render_view", desk, jobs)
+    SERVICES.iter().try_for_each(|service| {
+        let name = service.name;
+        match service.kind {
+            Kind::SaveMap => serve::<SaveMap::Service>(link, name, desk, jobs),
+            Kind::LoadMap => serve::<LoadMap::Service>(link, name, desk, jobs),
+            Kind::Export => serve::<Export::Service>(link, name, desk, jobs),
+            Kind::Reset | Kind::Pause | Kind::Resume => {
+                serve::<Trigger::Service>(link, name, desk, jobs)
+            }
+            Kind::GetSplats => serve::<GetSplats::Service>(link, name, desk, jobs),
+            Kind::RenderView => serve::<RenderView::Service>(link, name, desk, jobs),
+        }
+    })
 }
 
 fn serve<T>(
