@@ -1,6 +1,6 @@
 //! A camera is recorded, and the recording is read back.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
@@ -29,16 +29,21 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
 ";
 
 fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
-    std::fs::write("/tmp/camera.yaml", CALIBRATION)?;
-    let url = "source.camera_info_url=file:///tmp/camera.yaml";
+    let folder = tempfile::tempdir()?;
+    let (yaml, bag) = (
+        folder.path().join("camera.yaml"),
+        folder.path().join("drive.mcap"),
+    );
+    std::fs::write(&yaml, CALIBRATION)?;
+    let url = format!("source.camera_info_url=file://{}", yaml.display());
     let wanted = Wanted {
         source: format!("v4l2:{}", device.display()),
-        out: PathBuf::from("/tmp/drive.mcap"),
+        out: bag.clone(),
         duration_secs: Some(3.0),
         seed: 0,
     };
     let settings = Settings::shipped().params()?;
-    let from = params(&[url, "source.camera.rate=15"])?;
+    let from = params(&[&url, "source.camera.rate=15"])?;
     let done = record(
         &wanted,
         &from,
@@ -48,7 +53,7 @@ fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
     )?;
     println!("  {done:?}");
     ensure!(done.n_pictures + done.n_dropped >= 30, "{done:?}");
-    let mut replay = source::open("mcap:/tmp/drive.mcap", &params(&[])?, 0)?;
+    let mut replay = source::open(&format!("mcap:{}", bag.display()), &params(&[])?, 0)?;
     let mut last = None;
     let mut n_frames = 0;
     while let Some(frame) = replay.next() {
@@ -77,7 +82,7 @@ fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
         done.n_pictures
     );
     ensure!(replay.counts().fault.is_none(), "{:?}", replay.counts());
-    let size = std::fs::metadata("/tmp/drive.mcap")?.len();
+    let size = std::fs::metadata(&bag)?.len();
     println!("  {n_frames} frames read back from {size} bytes");
     Ok(())
 }

@@ -1,5 +1,6 @@
 //! Comments of `launch/params.yaml` -> what a tool can show of each parameter.
 
+use crate::config::range::commented;
 use crate::config::{PARAMS_YAML, Range, Settings};
 
 /// What the file says of one parameter.
@@ -26,30 +27,13 @@ impl Settings {
 
 /// Text between the range and the end of the line, of the embedded file, which we write ourselves.
 fn text_of(key: &str) -> Option<String> {
-    let mut groups: Vec<&str> = Vec::new();
-    for line in PARAMS_YAML.lines() {
-        let trimmed = line.trim_start();
-        let indent = line.len() - trimmed.len();
-        let Some((name, rest)) = trimmed.split_once(':') else {
-            continue;
-        };
-        if indent < 4 || trimmed.starts_with('#') {
-            continue;
-        }
-        groups.truncate((indent - 4) / 2);
-        groups.push(name);
-        if groups.join(".") != key {
-            continue;
-        }
-        let comment = rest.split_once(" # ")?.1.trim();
-        let closing = match comment.chars().next() {
-            Some('[') => ']',
-            Some('{') => '}',
-            _ => ':',
-        };
-        return Some(comment.split_once(closing)?.1.trim().to_owned());
-    }
-    None
+    let (_, comment) = commented(PARAMS_YAML).into_iter().find(|(k, _)| k == key)?;
+    let closing = match comment.chars().next() {
+        Some('[') => ']',
+        Some('{') => '}',
+        _ => ':',
+    };
+    Some(comment.split_once(closing)?.1.trim().to_owned())
 }
 
 #[cfg(test)]

@@ -62,8 +62,14 @@ impl std::fmt::Display for Range {
 
 /// Reads the ranges out of the comments of the embedded file, which we write ourselves: two spaces a level.
 pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
+    let ranged = |(key, comment): (String, &str)| Some((key, Range::of_comment(comment)?));
+    commented(text).into_iter().filter_map(ranged).collect()
+}
+
+/// Every parameter of the file with the comment behind its default; groups have none.
+pub(super) fn commented(text: &str) -> Vec<(String, &str)> {
     let mut groups: Vec<&str> = Vec::new();
-    let mut ranges = BTreeMap::new();
+    let mut found = Vec::new();
     for line in text.lines() {
         let trimmed = line.trim_start();
         let indent = line.len() - trimmed.len();
@@ -75,15 +81,10 @@ pub(super) fn ranges_of_comments(text: &str) -> BTreeMap<String, Range> {
         }
         groups.truncate((indent - 4) / 2);
         let key = [groups.as_slice(), &[name]].concat().join(".");
-        match rest
-            .split_once(" # ")
-            .and_then(|(_, comment)| Range::of_comment(comment.trim()))
-        {
-            Some(range) => {
-                ranges.insert(key, range);
-            }
+        match rest.split_once(" # ") {
+            Some((_, comment)) => found.push((key, comment.trim())),
             None => groups.push(name),
         }
     }
-    ranges
+    found
 }

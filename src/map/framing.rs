@@ -82,13 +82,10 @@ pub(super) fn read_section(
     let mut content = vec![0; n_bytes as usize];
     file.read_exact(&mut content)?;
     let crc = file.read_u32::<LittleEndian>()?;
-    if crc != section_crc(tag, length, &content) {
+    let parts: [&[u8]; 3] = [&tag, &length, &content];
+    let found = parts.into_iter().fold(0, crc32c::crc32c_append);
+    if crc != found {
         return Ok(Err(format!("the CRC of its {n_bytes} bytes does not fit")));
     }
     Ok(Ok((tag, content)))
-}
-
-fn section_crc(tag: [u8; 4], length: [u8; 8], content: &[u8]) -> u32 {
-    let frame = crc32c::crc32c_append(crc32c::crc32c(&tag), &length);
-    crc32c::crc32c_append(frame, content)
 }

@@ -121,8 +121,12 @@ impl SplatMap {
         let splats = self.engine.splats();
         let ids = self.ids.all();
         let finite = (0..splats.len()).filter(|i| splats.is_finite(*i));
-        let ids = finite.map(|i| ids[i]).collect();
-        (splats.into_finite(), ids)
+        let finite: Vec<usize> = finite.collect();
+        if finite.len() == splats.len() {
+            return (splats, ids.to_vec());
+        }
+        let ids = finite.iter().map(|i| ids[*i]).collect();
+        (splats.picked(&finite), ids)
     }
 
     /// While the end is known to be far, part of the room is kept for what is still to be seen.

@@ -3,6 +3,7 @@
 //! Each keyframe alone proposes one; the one that most others agree with counts, then the mean of those. Places a few
 //! steps apart hardly tell the scale; depth, which the map shows and the model states, does.
 
+use crate::geometry::two_view::median;
 use crate::map::align;
 use crate::pose::{Rigid, Similarity};
 
@@ -33,10 +34,8 @@ pub(super) struct Sight {
 
 /// `map_from_model`, and how many agree on it.
 pub(super) fn lay_over(sights: &[Sight]) -> Option<(Similarity, usize)> {
-    let scales: Vec<f64> = sights.iter().filter_map(|s| s.scale).collect();
-    let depths: Vec<f64> = sights.iter().filter_map(|s| s.depth).collect();
-    let scale = median(&scales)?;
-    let depth = median(&depths)?;
+    let scale = median_positive(sights.iter().filter_map(|s| s.scale))?;
+    let depth = median_positive(sights.iter().filter_map(|s| s.depth))?;
     let needed = MIN_AGREEING.max((MIN_SHARE * sights.len() as f64).ceil() as usize);
     let by_one = |sight: &Sight| {
         let rotation =
@@ -85,8 +84,7 @@ fn agreeing(sights: &[Sight], map_from_model: &Similarity, depth: f64) -> Vec<Si
 
 /// Scale by depth and by the spread of the places, each as far as it is known; rotation and place as means.
 fn mean(sights: &[Sight], scale: f64, depth: f64) -> Option<Similarity> {
-    let scales: Vec<f64> = sights.iter().filter_map(|s| s.scale).collect();
-    let by_depth = median(&scales).unwrap_or(scale);
+    let by_depth = median_positive(sights.iter().filter_map(|s| s.scale)).unwrap_or(scale);
     let pairs: Vec<(Rigid, Rigid)> = sights
         .iter()
         .map(|s| (s.map_from_cam, s.model_from_cam))
@@ -116,14 +114,10 @@ fn mean(sights: &[Sight], scale: f64, depth: f64) -> Option<Similarity> {
     (scale > 0.0 && scale.is_finite() && found.translation.is_finite()).then_some(found)
 }
 
-fn median(values: &[f64]) -> Option<f64> {
-    let mut sorted: Vec<f64> = values
-        .iter()
-        .copied()
-        .filter(|v| v.is_finite() && *v > 0.0)
-        .collect();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied()
+/// Of those that can be scales or depths.
+fn median_positive(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut usable: Vec<f64> = values.filter(|v| v.is_finite() && *v > 0.0).collect();
+    median(&mut usable)
 }
 
 #[cfg(test)]

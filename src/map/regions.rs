@@ -163,7 +163,7 @@ impl SplatMap {
                 continue;
             };
             let map_from_anchor = map_poses[placed.view_ix].inverse();
-            let region = picked(splats, &rows);
+            let region = splats.picked(&rows);
             let of_rows: Vec<u16> = rows
                 .iter()
                 .map(|ix| ages.get(*ix).copied().unwrap_or(0))
@@ -307,22 +307,4 @@ impl SplatMap {
             self.regions.has_warned = true;
         }
     }
-}
-
-fn picked(splats: &Splats, rows: &[usize]) -> Splats {
-    let stride = splats.sh_stride();
-    let mut some = Splats {
-        sh_degree: splats.sh_degree,
-        ..Splats::default()
-    };
-    for &i in rows {
-        some.means.push(splats.means[i]);
-        some.log_scales.push(splats.log_scales[i]);
-        some.quats.push(splats.quats[i]);
-        some.opacity_logits.push(splats.opacity_logits[i]);
-        some.anchors.push(splats.anchors[i]);
-        some.sh
-            .extend_from_slice(&splats.sh[i * stride..(i + 1) * stride]);
-    }
-    some
 }

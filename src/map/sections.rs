@@ -102,21 +102,25 @@ pub(super) fn splat_bytes(splats: &Splats) -> Vec<u8> {
 }
 
 pub(super) fn parse_splats(content: &[u8]) -> Result<Splats, String> {
-    let (head, body) = content.split_first_chunk::<4>().ok_or("no SH degree")?;
-    let sh_degree = u32::from_le_bytes(*head);
-    let sh_degree = u8::try_from(sh_degree)
+    let (head, run) = content.split_first_chunk::<4>().ok_or("no SH degree")?;
+    parse_run(parse_degree(u32::from_le_bytes(*head))?, run)
+}
+
+fn parse_degree(word: u32) -> Result<u8, String> {
+    u8::try_from(word)
         .ok()
-        .filter(|degree| *degree <= layout::MAX_SH_DEGREE);
+        .filter(|degree| *degree <= layout::MAX_SH_DEGREE)
+        .ok_or_else(|| format!("SH degree {word}, expected 0 to {}", layout::MAX_SH_DEGREE))
+}
+
+fn parse_run(sh_degree: u8, run: &[u8]) -> Result<Splats, String> {
     let mut splats = Splats {
-        sh_degree: sh_degree.ok_or("its SH degree is above 3")?,
+        sh_degree,
         ..Splats::default()
     };
-    layout::decode(body, &mut splats)
-        .ok_or_else(|| format!("{} bytes are no whole number of splats", body.len()))?;
-    match layout::fault(&splats) {
-        Some(reason) => Err(reason),
-        None => Ok(splats),
-    }
+    layout::decode(run, &mut splats)
+        .ok_or_else(|| format!("{} bytes are no whole number of splats", run.len()))?;
+    layout::fault(&splats).map_or(Ok(splats), Err)
 }
 
 /// Of the splats in their order.
@@ -205,10 +209,7 @@ fn region_len(n: usize, sh_degree: u8) -> usize {
 pub(super) fn take_region(rest: &mut &[u8]) -> Result<(Splats, Vec<u16>), String> {
     let mut word = || rest.read_u32::<LittleEndian>().map_err(|e| e.to_string());
     let (sh_degree, n) = (word()?, word()? as usize);
-    let sh_degree = u8::try_from(sh_degree)
-        .ok()
-        .filter(|degree| *degree <= layout::MAX_SH_DEGREE)
-        .ok_or("its SH degree is above 3")?;
+    let sh_degree = parse_degree(sh_degree)?;
     let (ages, after) = rest
         .split_at_checked(2 * n)
         .ok_or_else(|| format!("{n} splats are announced, the section ends"))?;
@@ -216,15 +217,7 @@ pub(super) fn take_region(rest: &mut &[u8]) -> Result<(Splats, Vec<u16>), String
         .split_at_checked(n * layout::bytes_per_splat(sh_degree))
         .ok_or_else(|| format!("{n} splats are announced, the section ends"))?;
     *rest = after;
-    let mut splats = Splats {
-        sh_degree,
-        ..Splats::default()
-    };
-    layout::decode(run, &mut splats).ok_or("no whole number of splats")?;
-    match layout::fault(&splats) {
-        Some(reason) => Err(reason),
-        None => Ok((splats, parse_ages(ages)?)),
-    }
+    Ok((parse_run(sh_degree, run)?, parse_ages(ages)?))
 }
 
 /// Bytes of all parts together.

@@ -1,4 +1,4 @@
-//! Losses of steps -> a curve of bounded length, and whether more steps on the same views would still pay.
+//! Losses of steps -> whether more steps on the same views would still pay.
 
 use crate::map::SplatMap;
 

@@ -30,21 +30,16 @@ struct Matrix {
     data: Vec<f64>,
 }
 
-/// What the parameter `source.camera_info_url` names: a path or `file://` URL; `None` when it is empty.
-pub fn of_url(url: &str) -> Result<Option<CameraInfo>, SourceError> {
+/// What the parameter `source.camera_info_url` names, and its lens: a path or `file://` URL; `None` when it is empty.
+pub fn of_url(url: &str) -> Result<Option<(CameraInfo, Lens)>, SourceError> {
     if url.is_empty() {
         return Ok(None);
     }
     let path = path_of(url).map_err(|reason| fail(reason, Path::new(url)))?;
     let bytes = read_small(&path, MAX_FILE_BYTES).map_err(|reason| fail(reason, &path))?;
     let info = of_yaml(&String::from_utf8_lossy(&bytes)).map_err(|reason| fail(reason, &path))?;
-    lens_of_camera_info(&info, false).map_err(|reason| fail(reason, &path))?;
-    Ok(Some(info))
-}
-
-/// The lens of a calibration that `of_url` gave.
-pub fn lens_of(info: &CameraInfo, url: &str) -> Result<Lens, SourceError> {
-    lens_of_camera_info(info, false).map_err(|reason| fail(reason, Path::new(url)))
+    let lens = lens_of_camera_info(&info, false).map_err(|reason| fail(reason, &path))?;
+    Ok(Some((info, lens)))
 }
 
 fn fail(reason: String, path: &Path) -> SourceError {
@@ -124,7 +119,7 @@ projection_matrix:
     #[test]
     fn a_calibration_file_gives_a_lens_with_centres_at_half() {
         let info = of_yaml(FILE).unwrap();
-        let lens = lens_of(&info, "").unwrap();
+        let lens = lens_of_camera_info(&info, false).unwrap();
         let i = lens.intrinsics;
         assert_eq!(
             (i.width_px, i.height_px, i.fx, i.fy),

@@ -71,7 +71,7 @@ impl McapSource {
         }
         let depth_topic = depth_topic_of(&survey, params);
         let lens = match camera_info::of_url(&params.camera_info_url)? {
-            Some(info) => Some(camera_info::lens_of(&info, &params.camera_info_url)?),
+            Some((_, lens)) => Some(lens),
             None => lens_of(&survey, &image_topic, params),
         };
         let (is_compressed, n_images) = (topic.is_compressed(), topic.n_messages);

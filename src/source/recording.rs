@@ -203,7 +203,10 @@ fn open(
     if let Some(secs) = wanted.duration_secs {
         live.end_after(secs);
     }
-    Ok(Input::Camera(Box::new(live), info.map(Box::new)))
+    Ok(Input::Camera(
+        Box::new(live),
+        info.map(|(info, _)| Box::new(info)),
+    ))
 }
 
 fn from_camera(

@@ -339,18 +339,13 @@ impl Splats {
             .extend_from_slice(&others.sh[i * stride..(i + 1) * stride]);
     }
 
-    /// Only splats whose every number is finite: clients and viewers rely on it.
-    pub fn into_finite(self) -> Self {
-        if (0..self.len()).all(|i| self.is_finite(i)) {
-            return self;
-        }
-        let mut kept = Self {
+    /// Some of them, in the order of their indices given.
+    pub fn picked(&self, ixs: &[usize]) -> Self {
+        let mut some = Self {
             sh_degree: self.sh_degree,
             ..Self::default()
         };
-        for i in (0..self.len()).filter(|i| self.is_finite(*i)) {
-            kept.push(&self, i);
-        }
-        kept
+        ixs.iter().for_each(|ix| some.push(self, *ix));
+        some
     }
 }

@@ -37,7 +37,7 @@ fn recorded(script: &Script, url: &str, out: &Path, params: &RecordParams) -> Pr
     let asked = Arc::default();
     live.end_when(&asked);
     live.end_after(1.5);
-    let input = Input::Camera(Box::new(live), info.map(Box::new));
+    let input = Input::Camera(Box::new(live), info.map(|(info, _)| Box::new(info)));
     let wanted = Wanted {
         source: "script".to_owned(),
         out: out.to_owned(),

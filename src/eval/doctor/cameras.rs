@@ -2,8 +2,6 @@
 
 use super::Check;
 
-const NONE_FIX: &str = "plug a camera in; in a container, pass it on with --device /dev/video0";
-
 #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
 pub(super) fn cameras() -> Check {
     check_of(&crate::source::v4l2::list::list())
@@ -26,10 +24,11 @@ mod found {
     use std::path::PathBuf;
 
     use super::super::{Check, State};
-    use super::NONE_FIX;
     use crate::source::camera::CameraError;
     use crate::source::camera::modes::{Offer, hz};
     use crate::source::v4l2::list::Found;
+
+    const NONE_FIX: &str = "plug a camera in; in a container, pass it on with --device /dev/video0";
 
     type Listed = (PathBuf, Result<Found, CameraError>);
 

@@ -123,7 +123,7 @@ impl CameraSource {
     /// Opens the camera, so that a wrong name, a lock or a missing permission is known at the start.
     pub fn open(name: String, open: Opener, params: &SourceParams) -> Result<Self, SourceError> {
         let lens = match camera_info::of_url(&params.camera_info_url)? {
-            Some(info) => Some(camera_info::lens_of(&info, &params.camera_info_url)?),
+            Some((_, lens)) => Some(lens),
             None => {
                 tracing::info!(
                     "no source.camera_info_url: the camera counts as uncalibrated, its focal length is estimated"
