@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint v4l2-test record-kill-test bench ablation soak onnx-test ros2-test setup
+.PHONY: demo test lint zenoh-test v4l2-test record-kill-test bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -17,6 +17,10 @@ lint:
 	scripts/setup lint
 	cargo fmt --check
 	cargo clippy --release --locked --all-targets -- -D warnings
+
+# What goes out, read, asked and harassed over zenoh by clients from PyPI.
+zenoh-test:
+	scripts/zenoh_test
 
 # Cameras: boots a kernel with made-up ones in QEMU and holds docs/CAMERAS.md against them. Says so where it is skipped.
 v4l2-test:

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 
+import keys
 import numpy
 import zenoh
 from mcap.reader import make_reader
@@ -299,6 +300,8 @@ def main():
         report = json.loads((out / "report.json").read_text())
         time.sleep(1.0)
         check_topics(heard, report)
+        tokens = [str(t.ok.key_expr) for t in session.liveliness().get("@ros2_lv/0/**") if t.ok is not None]
+        keys.check(tokens, list(heard.topics), session, expect)
         deltas = [k for k in heard.topics if "/splats/delta/" in k]
         if deltas:
             key, payloads = deltas[0], heard.topics[deltas[0]]
