@@ -32,7 +32,8 @@ const MAX_COVISIBLE: usize = 8;
 /// Keyframes whose features are remembered, at least.
 const MIN_HELD: usize = 64;
 /// Where rough poses and depth put a feature, it is found within this share of the longer side, and its depth within this
-/// logarithm: poses of one window are off by a degree or two, and those of neighbouring ones hardly more.
+/// logarithm, if the views are so many keyframes apart: poses of one window are off by a degree or two, those of others drift.
+const NEAR_GAP: u32 = 8;
 const NEAR_SHARE: f64 = 0.15;
 const NEAR_DEPTH: f64 = 0.2;
 /// Longer side of the picture that `sfm.max_error_px` is meant for.
@@ -168,7 +169,7 @@ impl Matcher {
             .map(|&(a, b)| {
                 let (a, b) = if id(a) < id(b) { (a, b) } else { (b, a) };
                 let both = [&views[a], &views[b]];
-                let found = if id(a).abs_diff(id(b)) <= MIN_GAP {
+                let found = if id(a).abs_diff(id(b)) <= NEAR_GAP {
                     self.near(both, max_matches)
                 } else {
                     self.verified(both, max_matches)
