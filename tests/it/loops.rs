@@ -143,6 +143,8 @@ fn windows(
             .iter()
             .map(|k| (k.id, Arc::clone(&k.frame.image)))
             .collect();
+        let taken = filmed.keyframes.iter().map(|k| (k.id, k.frame.stamp));
+        aligner.note_stamps(taken);
         let joined = aligner.place(window, &pictures, true);
         n_loops += usize::from(joined.is_loop);
         let views = joined
@@ -244,6 +246,32 @@ fn a_loop_of_pictures_alone_takes_most_of_the_drift() {
     assert!(with.n_loops > 0 && with.n_components == 1, "{with:?}");
     let left = with.ate_percent / without.ate_percent;
     assert!(left <= MAX_LEFT, "{left:.2} of the error is left");
+}
+
+/// Every bay is like the next, to the last stain.
+#[test]
+fn a_hallway_of_equal_bays_is_not_taken_for_a_loop() {
+    for seed in 0..3 {
+        let filmed = film(
+            &format!("hallway?frames=110&width=160&height=120&seed={seed}"),
+            2,
+        );
+        let align = params(&[]).align;
+        let found = windows(&filmed, &align, (1200, &Noise::STATED), seed, &[]);
+        eprintln!("hallway {seed}: windows {found:?}");
+        assert_eq!((found.n_loops, found.n_components), (0, 1));
+        // Taking one bay for the next makes it a third.
+        assert!(found.ate_percent < 10.0, "{found:?}");
+        // Where a part of the way was not seen, its ends join only if they fit.
+        let broken = windows(&filmed, &align, (1200, &Noise::STATED), seed, &[4]);
+        eprintln!("broken: {broken:?}");
+        assert_eq!(broken.n_loops, 0);
+        assert!(broken.n_components > 1, "{broken:?}");
+    }
+    let filmed = film("hallway?frames=110&width=160&height=120", 2);
+    let found = sfm(&filmed, &["sfm.max_features=1200"], 0);
+    eprintln!("pictures alone: {found:?}");
+    assert_eq!(found.n_loops, 0);
 }
 
 /// Held-out PSNR where the lap ends over where it began, and elsewhere; corrections that were told.

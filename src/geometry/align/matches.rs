@@ -31,11 +31,9 @@ const GRID: usize = 12;
 const MAX_COVISIBLE: usize = 8;
 /// Keyframes whose features are remembered, at least.
 const MIN_HELD: usize = 64;
-/// Where rough poses and depth put a feature, it is found within this share of the longer side, and its depth within this
-/// logarithm, if the views are so many keyframes apart: poses of one window are off by a degree or two, those of others drift.
-const NEAR_GAP: u32 = 8;
-const NEAR_SHARE: f64 = 0.15;
-const NEAR_DEPTH: f64 = 0.2;
+/// Where one view puts a feature and where the other does, by rough poses and depth, is apart by at most this share of the
+/// depth; of neighbours in time, since poses drift.
+const NEAR_SHARE: f64 = 0.3;
 /// Longer side of the picture that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
 /// The focal length that verification rests on is the network's, so it is laxer than with a calibrated camera.
@@ -169,7 +167,7 @@ impl Matcher {
             .map(|&(a, b)| {
                 let (a, b) = if id(a) < id(b) { (a, b) } else { (b, a) };
                 let both = [&views[a], &views[b]];
-                let found = if id(a).abs_diff(id(b)) <= NEAR_GAP {
+                let found = if id(a).abs_diff(id(b)) <= MIN_GAP {
                     self.near(both, max_matches)
                 } else {
                     self.verified(both, max_matches)
@@ -256,17 +254,14 @@ impl Matcher {
         let lens = |view: &View| self.shot(view).lens;
         let lenses = [lens(a), lens(b)];
         let b_from_a = b.batch_from_cam.inverse() * a.batch_from_cam;
-        let reach = NEAR_SHARE * f64::from(lenses[1].width_px.max(lenses[1].height_px));
         self.agreeing([a, b], max_matches, &|at_a, at_b| {
             let Some(depth) = depth_at(&a.depth, &lenses[0], at_a) else {
                 return true;
             };
-            let point = b_from_a.transform_point(lenses[0].ray_in_cam(at_a) * depth);
-            let is_close = lenses[1]
-                .project(point)
-                .is_some_and(|p| p.distance(at_b) <= reach);
-            let found = depth_at(&b.depth, &lenses[1], at_b);
-            is_close && found.is_none_or(|z| (z / point.z).ln().abs() <= NEAR_DEPTH)
+            let by_a = b_from_a.transform_point(lenses[0].ray_in_cam(at_a) * depth);
+            let z = depth_at(&b.depth, &lenses[1], at_b).unwrap_or(by_a.z);
+            let by_b = lenses[1].ray_in_cam(at_b) * z;
+            by_a.distance(by_b) <= NEAR_SHARE * depth.max(z)
         })
     }
 
