@@ -15,7 +15,7 @@ use crate::gpu::GpuError;
 use crate::source::rectify::Rectifier;
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
-const MAX_HELD: usize = 96;
+const MAX_HELD: usize = 32;
 /// Poses that moved its pixels by more since the sweep make a depth map out of date.
 const MAX_DRIFT_PX: f64 = 1.0;
 
