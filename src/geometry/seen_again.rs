@@ -51,6 +51,12 @@ pub fn may_have_walked(
     from.1.distance(to.1) <= reach + max_drift * way_length
 }
 
+/// Of a way through these places.
+pub fn length(places: impl Iterator<Item = DVec3> + Clone) -> f64 {
+    let steps = places.clone().zip(places.skip(1));
+    steps.map(|(from, to)| from.distance(to)).sum()
+}
+
 /// What most steps stay below; 0 of a single stand.
 fn speed_of(way: &[Stand]) -> f64 {
     let speed = |two: &[Stand]| {
@@ -69,7 +75,7 @@ pub fn may_have_drifted(way: &[DVec3], correction: &Similarity, max_drift: f64) 
     let Some(end) = way.last() else {
         return false;
     };
-    let length: f64 = way.windows(2).map(|two| two[0].distance(two[1])).sum();
+    let length = length(way.iter().copied());
     let shift = correction.transform_point(*end).distance(*end);
     shift <= max_drift * length
         && correction.angle() <= MAX_TURN

@@ -83,7 +83,7 @@ pub(super) fn run_publisher(outbox: Option<&Outbox>, snapshots: &Receiver<Outgoi
     let mut complaints = Complaints::default();
     while let Some(outgoing) = snapshots.recv() {
         if let Some(outbox) = outbox {
-            complaints.of(publish(outbox, &outgoing));
+            publish_or_say(outbox, &outgoing, &mut complaints);
         }
     }
 }

@@ -130,6 +130,7 @@ fn windows(
     let mut sfm = self::params(&[]).sfm;
     sfm.max_features = max_features;
     let mut aligner = Aligner::new(params, &sfm, seed).unwrap();
+    aligner.note_stamps(filmed.keyframes.iter().map(|k| (k.id, k.frame.stamp)));
     let mut poses: BTreeMap<u32, (u32, Rigid)> = BTreeMap::new();
     let mut n_loops = 0;
     for (n, from) in (0..filmed.views.len().saturating_sub(7))
@@ -143,8 +144,6 @@ fn windows(
             .iter()
             .map(|k| (k.id, Arc::clone(&k.frame.image)))
             .collect();
-        let taken = filmed.keyframes.iter().map(|k| (k.id, k.frame.stamp));
-        aligner.note_stamps(taken);
         let joined = aligner.place(window, &pictures, true);
         n_loops += usize::from(joined.is_loop);
         let views = joined

@@ -190,14 +190,10 @@ fn can_follow(
     ends: (u32, u32),
     max_drift: f64,
 ) -> bool {
-    let length = |part: &[Stand]| -> f64 {
-        let steps = part.windows(2).map(|two| two[0].1.distance(two[1].1));
-        steps.sum()
-    };
-    let between = |part: &[(u32, Stand)], a: u32, b: u32| -> Vec<Stand> {
+    let length = |part: &[(u32, Stand)], a: u32, b: u32| {
         let (low, high) = (a.min(b), a.max(b));
         let inside = part.iter().filter(|(id, _)| (low..=high).contains(id));
-        inside.map(|(_, stand)| *stand).collect()
+        seen_again::length(inside.map(|(_, stand)| stand.1))
     };
     from.iter().enumerate().all(|(ix, (id, _))| {
         let next = to.partition_point(|(other, _)| other < id);
@@ -212,7 +208,7 @@ fn can_follow(
         }
         let before: Vec<Stand> = from[..=ix].iter().map(|(_, stand)| *stand).collect();
         let behind: Vec<Stand> = to[next..].iter().map(|(_, stand)| *stand).collect();
-        let way = length(&between(from, ends.0, *id)) + length(&between(to, ends.1, *begin));
+        let way = length(from, ends.0, *id) + length(to, ends.1, *begin);
         seen_again::may_have_walked((&before, &behind), way, max_drift)
     })
 }

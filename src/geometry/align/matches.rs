@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::loops::Kept;
 use super::{Matched, Pair, Shot, depth_at};
+use crate::camera::Intrinsics;
 use crate::config::SfmParams;
 use crate::config::align::AlignParams;
 use crate::frame::RgbImage;
@@ -222,16 +223,22 @@ impl Matcher {
         }
     }
 
-    pub(super) fn shot(&self, view: &View) -> Shot {
+    /// Of the working picture.
+    fn lens(&self, view: &View) -> Intrinsics {
         let i = &view.intrinsics;
         let held = self.held.get(&view.keyframe_id);
         let size = held.map_or_else(
             || working_size(i.width_px, i.height_px, self.max_side),
             |held| held.size,
         );
+        i.resized(size.0, size.1)
+    }
+
+    pub(super) fn shot(&self, view: &View) -> Shot {
+        let held = self.held.get(&view.keyframe_id);
         Shot {
             cam_from_batch: view.batch_from_cam.inverse(),
-            lens: i.resized(size.0, size.1),
+            lens: self.lens(view),
             is_held: false,
             pixels: held.map_or_else(Vec::new, |held| held.features.pixels.clone()),
         }
@@ -251,8 +258,7 @@ impl Matcher {
 
     /// The same of views whose rough poses count: where surfaces look alike, a match may be of another one.
     fn near(&self, [a, b]: [&View; 2], max_matches: usize) -> Numbers {
-        let lens = |view: &View| self.shot(view).lens;
-        let lenses = [lens(a), lens(b)];
+        let lenses = [self.lens(a), self.lens(b)];
         let b_from_a = b.batch_from_cam.inverse() * a.batch_from_cam;
         self.agreeing([a, b], max_matches, &|at_a, at_b| {
             let Some(depth) = depth_at(&a.depth, &lenses[0], at_a) else {
@@ -294,10 +300,7 @@ impl Matcher {
             )
         };
         let pairs: Vec<_> = raw.iter().map(pixels).collect();
-        let lenses = [
-            a.intrinsics.resized(first.size.0, first.size.1),
-            b.intrinsics.resized(second.size.0, second.size.1),
-        ];
+        let lenses = [self.lens(a), self.lens(b)];
         let longest = f64::from(first.size.0.max(first.size.1));
         let limit = LAXITY * self.max_error_px * longest / ERROR_SIDE_PX;
         let seed = self.seed ^ (u64::from(a.keyframe_id) << 32 | u64::from(b.keyframe_id));
