@@ -96,14 +96,16 @@ pub(crate) fn each_format(device: &Path, is_vivid: bool) -> anyhow::Result<()> {
         .collect();
     names.dedup();
     for name in names {
-        one_format(device, name, is_vivid).with_context(|| name.to_owned())?;
+        let wanted = format!("source.camera.formats={name}");
+        open(device, &[&wanted, "source.camera.rate=15"])
+            .and_then(|live| check_pictures(live, name, is_vivid))
+            .with_context(|| name.to_owned())?;
     }
     Ok(())
 }
 
-fn one_format(device: &Path, name: &str, is_vivid: bool) -> anyhow::Result<()> {
-    let wanted = format!("source.camera.formats={name}");
-    let mut live = open(device, &[&wanted, "source.camera.rate=15"])?;
+/// Pictures are of the right number, size, order and age, and differ.
+pub(crate) fn check_pictures(mut live: Live, name: &str, is_vivid: bool) -> anyhow::Result<()> {
     let layout = live.layout();
     let mut pictures = Vec::new();
     let mut jpeg = Jpeg::default();

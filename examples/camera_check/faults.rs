@@ -14,9 +14,9 @@ use crate::Check;
 use crate::capture::{open, params, take};
 
 /// Bars of the task: an error is said, silence is noticed, frames come again.
-const SAID_WITHIN: f64 = 1.0;
+pub(crate) const SAID_WITHIN: f64 = 1.0;
 const SILENCE_SAID_WITHIN: f64 = 3.0;
-const BACK_WITHIN: f64 = 2.0;
+pub(crate) const BACK_WITHIN: f64 = 2.0;
 
 pub(crate) const ALL: [(&str, Check); 8] = [
     ("an unplugged camera is said and comes back", unplug),
@@ -29,12 +29,12 @@ pub(crate) const ALL: [(&str, Check); 8] = [
     ("a name that is no camera says so", no_camera),
 ];
 
-fn set(device: &Path, name: &str, value: i32) -> anyhow::Result<()> {
+pub(crate) fn set(device: &Path, name: &str, value: i32) -> anyhow::Result<()> {
     Ok(v4l2::set_control(device, name, value)?)
 }
 
 /// Waits until the camera says that it streams, or does not, and returns the seconds.
-fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> anyhow::Result<f64> {
+pub(crate) fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> anyhow::Result<f64> {
     let watch = Stopwatch::start();
     while health.get().is_streaming != is_streaming {
         if watch.secs() > within {
@@ -46,7 +46,7 @@ fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> anyhow::Resul
 }
 
 /// Reads on another thread, as the source's thread does, while `disturb` runs.
-fn while_reading<T>(
+pub(crate) fn while_reading<T>(
     mut live: Live,
     disturb: impl FnOnce(&HealthWatch) -> anyhow::Result<T>,
 ) -> anyhow::Result<(T, Tally, u64)> {

@@ -9,6 +9,8 @@ mod capture;
 mod faults;
 #[cfg(target_os = "linux")]
 mod tape;
+#[cfg(all(target_os = "linux", feature = "camera-nokhwa"))]
+mod webcam;
 
 #[cfg(target_os = "linux")]
 fn main() -> std::process::ExitCode {
@@ -30,6 +32,8 @@ fn main() -> std::process::ExitCode {
     if is_vivid {
         checks.extend(faults::ALL);
         checks.extend(tape::ALL);
+        #[cfg(feature = "camera-nokhwa")]
+        checks.extend(webcam::ALL);
     }
     let mut n_failed = 0;
     for (name, check) in checks {

@@ -3,13 +3,14 @@
 //! The pinhole keeps the size and the ratio of focal lengths, and has the widest view of which every pixel lies in
 //! the lens's picture: no black corners. It looks at the centre of the undistorted picture.
 
+mod remap;
+
 use glam::DVec2;
-use multiversion::multiversion;
 
 use crate::camera::{Distortion, Intrinsics, Lens};
 use crate::frame::RgbImage;
 use crate::source::decode::empty;
-use crate::source::pixels::resize;
+use crate::source::rectify::remap::Table;
 
 /// Tangent of the widest half view of the pinhole (60 deg): beyond it a fisheye's rim would be smeared over most
 /// of the picture.
@@ -19,25 +20,10 @@ const RIM_POINTS: u32 = 96;
 /// A pinhole that would show less than this share of the lens's view means a calibration that does not fit.
 const MIN_VIEW_SHARE: f64 = 0.2;
 
-/// Whole weight of a pixel; the sum of four products with 8 bits then fits 20 bits.
-const WHOLE: u32 = 4096;
-/// Bytes behind the last pixel that may be read, since two pixels are read as eight bytes.
-const PAD_BYTES: usize = 8;
-/// Pixels that are mixed at once: two registers of eight numbers.
-const BLOCK: usize = 16;
-
-/// Where one pixel comes from: the left upper one of four, and the weights of the right and the lower ones.
-#[derive(Debug, Clone, Copy)]
-struct Tap {
-    offset: u32,
-    right: u16,
-    below: u16,
-}
-
 pub struct Rectifier {
     /// The camera of the pictures that come out.
     pub pinhole: Intrinsics,
-    taps: Vec<Tap>,
+    table: Table,
 }
 
 impl std::fmt::Debug for Rectifier {
@@ -58,22 +44,12 @@ impl Rectifier {
     /// numbers that are no lens.
     pub fn onto(pinhole: &Intrinsics, lens: &Lens) -> Option<Self> {
         let pinhole = *pinhole;
-        let (width, height) = (pinhole.width_px, pinhole.height_px);
-        let mut taps = Vec::with_capacity(width as usize * height as usize);
-        for y in 0..height {
-            for x in 0..width {
-                let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                let at = lens.project(pinhole.ray_in_cam(pixel))?;
-                let (column, right) = weighed(at.x, width);
-                let (row, below) = weighed(at.y, height);
-                taps.push(Tap {
-                    offset: 3 * (row * width + column),
-                    right,
-                    below,
-                });
-            }
-        }
-        Some(Self { pinhole, taps })
+        let table = Table::new((pinhole.width_px, pinhole.height_px), |x, y| {
+            let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let at = lens.project(pinhole.ray_in_cam(pixel))?;
+            Some((at.x - 0.5, at.y - 0.5))
+        })?;
+        Some(Self { pinhole, table })
     }
 
     /// The picture must have the size of the lens.
@@ -85,96 +61,13 @@ impl Rectifier {
 
     /// The same into a picture whose memory is used again; `picture` comes out as it went in.
     pub fn rectify_into(&self, picture: &mut RgbImage, out: &mut RgbImage) {
-        let (width_px, height_px) = (self.pinhole.width_px, self.pinhole.height_px);
-        assert_eq!(
-            (picture.width_px, picture.height_px),
-            (width_px, height_px),
-            "table for another size"
-        );
-        resize(out, width_px, height_px);
-        let n_bytes = picture.pixels.len();
-        picture.pixels.resize(n_bytes + PAD_BYTES, 0);
-        let row_bytes = if height_px > 1 {
-            3 * width_px as usize
-        } else {
-            0
-        };
-        remap(&picture.pixels, row_bytes, &self.taps, &mut out.pixels);
-        picture.pixels.truncate(n_bytes);
+        self.table.remap(picture, out);
     }
 
     /// Where a pixel of the pinhole's picture lies in the lens's picture, in pixels with centres at +0.5.
     pub fn source_of(&self, x: u32, y: u32) -> DVec2 {
-        let width = self.pinhole.width_px;
-        let tap = self.taps[(y * width + x) as usize];
-        let share = |weight: u16| f64::from(weight) / f64::from(WHOLE);
-        let (row, column) = (tap.offset / 3 / width, tap.offset / 3 % width);
-        DVec2::new(
-            f64::from(column) + share(tap.right) + 0.5,
-            f64::from(row) + share(tap.below) + 0.5,
-        )
-    }
-}
-
-/// The pixel before a place along one side, and the weight of the one behind it. The rim is within a rounding error
-/// of the picture's.
-fn weighed(at: f64, n_px: u32) -> (u32, u16) {
-    let at = (at - 0.5).clamp(0.0, f64::from(n_px - 1));
-    let first = (at as u32).min(n_px.saturating_sub(2));
-    (
-        first,
-        ((at - f64::from(first)) * f64::from(WHOLE)).round() as u16,
-    )
-}
-
-/// Bilinear, in whole numbers: within 0.7 of a grey level of the exact value.
-#[multiversion(targets("x86_64+avx2"))]
-fn remap(source: &[u8], row_bytes: usize, taps: &[Tap], target: &mut [u8]) {
-    let (blocks, rest) = taps.as_chunks::<BLOCK>();
-    let (targets, target_rest) = target.split_at_mut(3 * BLOCK * blocks.len());
-    for (taps, target) in blocks.iter().zip(targets.chunks_exact_mut(3 * BLOCK)) {
-        mix(source, row_bytes, taps, target);
-    }
-    for (tap, target) in rest.iter().zip(target_rest.chunks_exact_mut(3)) {
-        mix(source, row_bytes, &[*tap], target);
-    }
-}
-
-/// Written for the compiler to vectorise: loads first, then the same arithmetic on `N` pixels.
-#[inline(always)]
-fn mix<const N: usize>(source: &[u8], row_bytes: usize, taps: &[Tap; N], target: &mut [u8]) {
-    let mut upper = [[0; N]; 2];
-    let mut lower = [[0; N]; 2];
-    for (ix, tap) in taps.iter().enumerate() {
-        let at = tap.offset as usize;
-        let two = |at: usize| {
-            let bytes = source[at..at + 8].first_chunk().expect("eight bytes");
-            u64::from_le_bytes(*bytes)
-        };
-        let (above, below) = (two(at), two(at + row_bytes));
-        (upper[0][ix], upper[1][ix]) = (above as u32, (above >> 24) as u32);
-        (lower[0][ix], lower[1][ix]) = (below as u32, (below >> 24) as u32);
-    }
-    let mut mixed = [0_u32; N];
-    for (ix, (tap, mixed)) in taps.iter().zip(&mut mixed).enumerate() {
-        let (right, below) = (u32::from(tap.right), u32::from(tap.below));
-        let both = (right * below + WHOLE / 2) / WHOLE;
-        let weights = [
-            WHOLE + both - right - below,
-            right - both,
-            below - both,
-            both,
-        ];
-        let corners = [upper[0][ix], upper[1][ix], lower[0][ix], lower[1][ix]];
-        let channel = |shift: u32| {
-            let [a, b, c, d] = corners.map(|pixel| (pixel >> shift) & 0xff);
-            let sum = a * weights[0] + b * weights[1] + c * weights[2] + d * weights[3];
-            (sum + WHOLE / 2) / WHOLE
-        };
-        *mixed = channel(0) | channel(8) << 8 | channel(16) << 16;
-    }
-    for (pixel, target) in mixed.iter().zip(target.chunks_exact_mut(3)) {
-        target.copy_from_slice(&pixel.to_le_bytes()[..3]);
+        let (x, y) = self.table.place(x, y);
+        DVec2::new(x + 0.5, y + 0.5)
     }
 }
 

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver as Released, RecvTimeoutError, sync_channel};
 use std::time::Duration;
 
 use nokhwa::Camera as Nokhwa;
@@ -17,10 +18,12 @@ use crate::source::SourceError;
 use crate::source::camera::live::Opener;
 use crate::source::camera::modes::{FORMATS, Offer, names, ranked};
 use crate::source::camera::stamps::ClockReading;
-use crate::source::camera::{Camera, CameraError, Layout, Shot};
+use crate::source::camera::{Camera, CameraError, Coding, Layout, Shot};
 
 /// Drivers may take seconds to open a camera, but not this long.
 const OPEN_WITHIN: Duration = Duration::from_secs(10);
+/// A thread that lets its camera go first reads one more picture.
+const RELEASED_WITHIN: Duration = Duration::from_secs(1);
 /// Pictures that may wait; an older one is worth nothing.
 const PICTURES: usize = 2;
 
@@ -40,7 +43,10 @@ enum News {
 struct Webcam {
     name: String,
     layout: Layout,
-    news: Receiver<News>,
+    /// `None` once the camera is let go.
+    news: Option<Receiver<News>>,
+    /// Nothing comes here; its other end goes with the thread.
+    is_released: Released<()>,
     /// Lent out as a `Shot`.
     bytes: Vec<u8>,
 }
@@ -73,19 +79,22 @@ fn open(
     }
     let (tx, news) = queue("webcam", PICTURES, WhenFull::DropOldest);
     let (wish, is_done) = (wish.clone(), Arc::clone(is_reading));
+    let (held, is_released) = sync_channel(0);
     let thread = std::thread::Builder::new().name("webcam".to_owned());
     let started = thread.spawn(move || {
         if let Err(reason) = read(index, &wish, &tx) {
             tx.send(News::Failed(reason)).ok();
         }
         is_done.store(false, Ordering::Release);
+        drop(held);
     });
     started.map_err(|e| fail(e.to_string()))?;
     match news.recv_timeout(OPEN_WITHIN) {
         Received::Item(News::Open(layout)) => Ok(Box::new(Webcam {
             name: name.to_owned(),
             layout,
-            news,
+            news: Some(news),
+            is_released,
             bytes: Vec::new(),
         })),
         Received::Item(News::Failed(reason)) => Err(fail(reason)),
@@ -129,7 +138,9 @@ fn read(index: u32, wish: &CameraParams, tx: &Sender<News>) -> Result<(), String
     let mut is_heard = tx.send(News::Open(layout)).is_ok();
     let mut sequence = 0_u32;
     while is_heard {
-        let bytes = camera.frame_raw().map_err(text)?.into_owned();
+        let mut bytes = camera.frame_raw().map_err(text)?.into_owned();
+        // On Linux, nokhwa hands out the whole buffer of the kernel.
+        bytes.truncate(most_bytes(&layout));
         let picture = News::Picture {
             bytes,
             sequence,
@@ -169,6 +180,16 @@ fn offers(formats: &[CameraFormat]) -> Vec<Offer> {
     formats.iter().filter_map(offer).collect()
 }
 
+/// Bytes of a raw picture; compressed ones end where they say.
+fn most_bytes(layout: &Layout) -> usize {
+    match layout.coding {
+        Coding::Raw(format, _) => {
+            format.row_bytes(layout.width_px) as usize * format.n_rows(layout.height_px) as usize
+        }
+        Coding::Mjpeg => usize::MAX,
+    }
+}
+
 fn read_clocks() -> ClockReading {
     let before_nanos = monotonic_nanos();
     let wall = Stamp::now();
@@ -176,6 +197,17 @@ fn read_clocks() -> ClockReading {
         before_nanos,
         wall,
         after_nanos: monotonic_nanos(),
+    }
+}
+
+/// Who opens the camera next must not find it busy.
+impl Drop for Webcam {
+    fn drop(&mut self) {
+        self.news = None;
+        let released = self.is_released.recv_timeout(RELEASED_WITHIN);
+        if released == Err(RecvTimeoutError::Timeout) {
+            tracing::warn!("{} hangs in its last read", self.name);
+        }
     }
 }
 
@@ -189,7 +221,10 @@ impl Camera for Webcam {
             reason,
             path: self.name.as_str().into(),
         };
-        match self.news.recv_timeout(wait) {
+        let Some(news) = &self.news else {
+            return Err(gone("it was let go".to_owned()));
+        };
+        match news.recv_timeout(wait) {
             Received::Item(News::Picture {
                 bytes,
                 sequence,

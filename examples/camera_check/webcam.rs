@@ -1,0 +1,68 @@
+//! The same cameras through nokhwa, which knows less of them.
+
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context, bail, ensure};
+use splat_mapper::source::camera::live::Live;
+use splat_mapper::source::{v4l2, webcam};
+
+use crate::Check;
+use crate::capture::{check_pictures, params};
+use crate::faults::{BACK_WITHIN, SAID_WITHIN, set, until, while_reading};
+
+/// nokhwa 0.1.4 for Linux does not know the kernel's name of grey pictures.
+const FORMATS: [&str; 4] = ["yuyv", "nv12", "rgb24", "bgr24"];
+
+pub(crate) const ALL: [(&str, Check); 3] = [
+    ("a webcam gives its pictures in each format", each_format),
+    ("an unplugged webcam is said and comes back", unplug),
+    ("a webcam that is not there says so", no_webcam),
+];
+
+fn open(index: &str, settings: &[&str]) -> anyhow::Result<Live> {
+    let opener = webcam::opener(index, &params(settings)?)?;
+    Ok(Live::open(format!("webcam:{index}"), opener)?)
+}
+
+/// Of the first camera, as `device` is.
+fn each_format(_: &Path, is_vivid: bool) -> anyhow::Result<()> {
+    for name in FORMATS {
+        let wanted = format!("source.camera.formats={name}");
+        open("0", &[&wanted, "source.camera.rate=15"])
+            .and_then(|live| check_pictures(live, name, is_vivid))
+            .with_context(|| name.to_owned())?;
+    }
+    Ok(())
+}
+
+fn unplug(device: &Path, _: bool) -> anyhow::Result<()> {
+    let live = open("0", &["source.camera.rate=15"])?;
+    let (_, tally, n_pictures) = while_reading(live, |health| {
+        // vivid stays unplugged while someone holds it open.
+        let holder = std::fs::File::open(device)?;
+        set(device, "disconnect", 1)?;
+        let said = until(health, false, SAID_WITHIN)?;
+        println!("  said after {said:.3} s: {:?}", health.get().fault);
+        std::thread::sleep(Duration::from_secs(1));
+        drop(holder);
+        let back = until(health, true, BACK_WITHIN)?;
+        println!("  back {back:.3} s after its return");
+        Ok(())
+    })?;
+    println!("  {n_pictures} pictures, {tally:?}");
+    ensure!(tally.interruptions == 1, "{tally:?}");
+    Ok(())
+}
+
+fn no_webcam(_: &Path, _: bool) -> anyhow::Result<()> {
+    match open("7", &[]) {
+        Ok(_) => bail!("there is no eighth camera"),
+        Err(error) => println!("  {error:#}"),
+    }
+    ensure!(
+        !v4l2::list::list().is_empty(),
+        "the cameras that are there stay listed"
+    );
+    Ok(())
+}
