@@ -222,13 +222,20 @@ impl Batcher {
         (self.keyframes.len() >= self.size).then(|| self.take())
     }
 
-    /// The last, shorter batch; `None` when every keyframe has been in one.
+    /// Keyframes that were in no batch so far.
+    pub fn n_new(&self) -> usize {
+        self.keyframes.len() - self.n_shared
+    }
+
+    /// A shorter batch: the last one, or live. `None` when every keyframe has been in one.
     pub fn finish(&mut self) -> Option<Batch> {
-        (self.keyframes.len() > self.n_shared).then(|| self.take())
+        (self.n_new() > 0).then(|| self.take())
     }
 
     fn take(&mut self) -> Batch {
-        let shared = self.keyframes.len().saturating_sub(self.overlap);
+        // No more than are new, else small batches would be made of what was there before.
+        let overlap = self.overlap.min(self.n_new());
+        let shared = self.keyframes.len().saturating_sub(overlap);
         let rest = self.keyframes[shared..].to_vec();
         let keyframes = std::mem::replace(&mut self.keyframes, rest);
         let batch = Batch {

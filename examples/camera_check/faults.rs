@@ -14,9 +14,9 @@ use crate::Check;
 use crate::capture::{open, params, take};
 
 /// Bars of the task: an error is said, silence is noticed, frames come again.
-pub(crate) const SAID_WITHIN: f64 = 1.0;
+const SAID_WITHIN: f64 = 1.0;
 const SILENCE_SAID_WITHIN: f64 = 3.0;
-pub(crate) const BACK_WITHIN: f64 = 2.0;
+const BACK_WITHIN: f64 = 2.0;
 
 pub(crate) const ALL: [(&str, Check); 8] = [
     ("an unplugged camera is said and comes back", unplug),
@@ -29,12 +29,12 @@ pub(crate) const ALL: [(&str, Check); 8] = [
     ("a name that is no camera says so", no_camera),
 ];
 
-pub(crate) fn set(device: &Path, name: &str, value: i32) -> anyhow::Result<()> {
+fn set(device: &Path, name: &str, value: i32) -> anyhow::Result<()> {
     Ok(v4l2::set_control(device, name, value)?)
 }
 
 /// Waits until the camera says that it streams, or does not, and returns the seconds.
-pub(crate) fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> anyhow::Result<f64> {
+fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> anyhow::Result<f64> {
     let watch = Stopwatch::start();
     while health.get().is_streaming != is_streaming {
         if watch.secs() > within {
@@ -46,7 +46,7 @@ pub(crate) fn until(health: &HealthWatch, is_streaming: bool, within: f64) -> an
 }
 
 /// Reads on another thread, as the source's thread does, while `disturb` runs.
-pub(crate) fn while_reading<T>(
+fn while_reading<T>(
     mut live: Live,
     disturb: impl FnOnce(&HealthWatch) -> anyhow::Result<T>,
 ) -> anyhow::Result<(T, Tally, u64)> {
@@ -72,7 +72,11 @@ pub(crate) fn while_reading<T>(
 }
 
 fn unplug(device: &Path, _: bool) -> anyhow::Result<()> {
-    let live = open(device, &["source.camera.rate=15"])?;
+    unplugged(open(device, &["source.camera.rate=15"])?, device)
+}
+
+/// The camera goes away while it is read, and comes back.
+pub(crate) fn unplugged(live: Live, device: &Path) -> anyhow::Result<()> {
     let (_, tally, n_pictures) = while_reading(live, |health| {
         // vivid stays unplugged while someone holds it open.
         let holder = std::fs::File::open(device)?;

@@ -1,7 +1,6 @@
 //! The same cameras through nokhwa, which knows less of them.
 
 use std::path::Path;
-use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use splat_mapper::source::camera::live::Live;
@@ -9,7 +8,7 @@ use splat_mapper::source::{v4l2, webcam};
 
 use crate::Check;
 use crate::capture::{check_pictures, params};
-use crate::faults::{BACK_WITHIN, SAID_WITHIN, set, until, while_reading};
+use crate::faults::unplugged;
 
 /// nokhwa 0.1.4 for Linux does not know the kernel's name of grey pictures.
 const FORMATS: [&str; 4] = ["yuyv", "nv12", "rgb24", "bgr24"];
@@ -37,22 +36,7 @@ fn each_format(_: &Path, is_vivid: bool) -> anyhow::Result<()> {
 }
 
 fn unplug(device: &Path, _: bool) -> anyhow::Result<()> {
-    let live = open("0", &["source.camera.rate=15"])?;
-    let (_, tally, n_pictures) = while_reading(live, |health| {
-        // vivid stays unplugged while someone holds it open.
-        let holder = std::fs::File::open(device)?;
-        set(device, "disconnect", 1)?;
-        let said = until(health, false, SAID_WITHIN)?;
-        println!("  said after {said:.3} s: {:?}", health.get().fault);
-        std::thread::sleep(Duration::from_secs(1));
-        drop(holder);
-        let back = until(health, true, BACK_WITHIN)?;
-        println!("  back {back:.3} s after its return");
-        Ok(())
-    })?;
-    println!("  {n_pictures} pictures, {tally:?}");
-    ensure!(tally.interruptions == 1, "{tally:?}");
-    Ok(())
+    unplugged(open("0", &["source.camera.rate=15"])?, device)
 }
 
 fn no_webcam(_: &Path, _: bool) -> anyhow::Result<()> {

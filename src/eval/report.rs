@@ -119,6 +119,9 @@ pub struct TrackingFigures {
     /// Times that the tracker got lost, and was found again without a hint.
     pub lost: u64,
     pub relocalised: u64,
+    /// With a pose at which their picture fits the splats best.
+    #[serde(default)]
+    pub fitted: u64,
     /// Milliseconds of work per frame.
     pub work_ms_p50: Option<f64>,
     pub work_ms_p95: Option<f64>,

@@ -205,6 +205,10 @@ impl Known {
 }
 
 impl GeometryModel for Known {
+    fn takes_small_batches(&self) -> bool {
+        self.aligner.is_none()
+    }
+
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         if self.aligner.is_some() {
             return self.infer_window(batch);

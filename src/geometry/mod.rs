@@ -175,4 +175,24 @@ pub trait GeometryModel: Send {
 
     /// Called once after the last batch: whatever can still be placed or improved.
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError>;
+
+    /// Live, instead of `infer`: poses of a batch without depth, where they are known long before it is.
+    fn poses(&mut self, _batch: &Batch) -> Option<GeometryBatch> {
+        None
+    }
+
+    /// Depth of one keyframe whose pose `poses` told; `None` when it is known of all.
+    fn depth(&mut self) -> Option<GeometryBatch> {
+        None
+    }
+
+    /// Keyframes that `depth` has still to tell of for the first time.
+    fn n_without_depth(&self) -> usize {
+        0
+    }
+
+    /// Whether it answers a batch of one new keyframe as well as a full one, once it has placed some.
+    fn takes_small_batches(&self) -> bool {
+        false
+    }
 }

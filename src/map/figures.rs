@@ -97,6 +97,11 @@ impl SplatMap {
         }
     }
 
+    /// (step, mean loss since the one before).
+    pub fn loss_curve(&self) -> &[(u64, f64)] {
+        &self.loss_curve
+    }
+
     pub(super) fn note_loss(&mut self) {
         let stats = self.engine.take_stats();
         if stats.n_steps > 0 {

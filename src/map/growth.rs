@@ -36,6 +36,19 @@ impl SplatMap {
         }
     }
 
+    pub(super) fn seed_all(&mut self, fresh: &[u32], deepened: &[u32]) {
+        if !fresh.is_empty() || !deepened.is_empty() {
+            self.unsettle();
+        }
+        let has_depth = |id: &&u32| self.keyframes.placed[*id].depth.width_px > 0;
+        let fresh = fresh.iter().filter(has_depth);
+        let ids: Vec<u32> = fresh.chain(deepened).copied().collect();
+        self.balance(ids.len() * self.params.seeds_per_keyframe);
+        for id in ids {
+            self.seed_from(id, false);
+        }
+    }
+
     pub(super) fn seed_from(&mut self, keyframe_id: u32, fills_gaps: bool) {
         let room = self.cap().saturating_sub(self.engine.n_splats());
         if room == 0 {

@@ -22,7 +22,6 @@ impl SplatMap {
     pub fn refine_held_out(&mut self) {
         self.note_loss();
         self.place_held_out();
-        let last = self.step_settings(Phase::Final(1.0));
         for id in self.held_out() {
             let was_here = self.is_here(id);
             if !self.visit(id) {
@@ -31,19 +30,7 @@ impl SplatMap {
             let view_ix = self.keyframes.placed[&id].view_ix;
             for step in 0..STEPS {
                 let rate = RATE * FINAL_RATE.powf(step as f32 / STEPS as f32);
-                let settings = StepSettings {
-                    train_splats: false,
-                    pose: PoseStep::Direct,
-                    lr_pose_rotation: rate,
-                    lr_pose_translation: rate * self.scene_depth,
-                    lr_focal: 0.0,
-                    depth_weight: 0.0,
-                    epipolar_weight: 0.0,
-                    opacity_reg: 0.0,
-                    scale_reg: 0.0,
-                    noise: 0.0,
-                    ..last.clone()
-                };
+                let settings = self.pose_only(rate);
                 self.engine.step(view_ix, &settings);
             }
             if !was_here {
@@ -52,6 +39,23 @@ impl SplatMap {
         }
         // These steps are no training: their losses must not enter the curve.
         self.engine.take_stats();
+    }
+
+    /// A step that moves nothing but the camera, at a rate in radians and shares of the scene's depth.
+    pub(super) fn pose_only(&self, rate: f32) -> StepSettings {
+        StepSettings {
+            train_splats: false,
+            pose: PoseStep::Direct,
+            lr_pose_rotation: rate,
+            lr_pose_translation: rate * self.scene_depth,
+            lr_focal: 0.0,
+            depth_weight: 0.0,
+            epipolar_weight: 0.0,
+            opacity_reg: 0.0,
+            scale_reg: 0.0,
+            noise: 0.0,
+            ..self.step_settings(Phase::Final(1.0))
+        }
     }
 
     /// How far the geometry can trust the pose of each keyframe of this run; lengths in the map's unit.

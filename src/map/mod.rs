@@ -8,6 +8,7 @@ pub mod checkpoint;
 pub mod correction;
 mod depth_scale;
 pub mod figures;
+pub mod frame_fit;
 mod framing;
 mod gauge;
 mod growth;
@@ -108,6 +109,8 @@ pub struct SplatMap {
     /// Steps between points of the curve.
     note_every: u64,
     settling: Settling,
+    /// Index of the engine's view that frames are compared in, once one was.
+    frame_view: Option<usize>,
 }
 
 impl std::fmt::Debug for SplatMap {
@@ -149,6 +152,7 @@ impl SplatMap {
             loss_curve: Vec::new(),
             note_every: FIRST_NOTE_EVERY,
             settling: Settling::default(),
+            frame_view: None,
         }
     }
 
@@ -315,11 +319,6 @@ impl SplatMap {
         self.engine.adapter()
     }
 
-    /// (step, mean loss since the one before).
-    pub fn loss_curve(&self) -> &[(u64, f64)] {
-        &self.loss_curve
-    }
-
     fn step_settings(&self, phase: Phase) -> StepSettings {
         schedule::settings(&self.params, self.scene_depth, self.pose_error, phase)
     }
@@ -335,14 +334,16 @@ impl SplatMap {
             self.pose_error[1].max((pose_error.translation * map_from_model.scale) as f32);
         self.pose_error[0] = self.pose_error[0].max(pose_error.rotation_rad as f32);
         self.hold_keyframes(self.n_unplaced(&views));
-        let mut fresh = Vec::new();
+        let (mut fresh, mut deepened) = (Vec::new(), Vec::new());
         for view in views {
             let given = self.keyframes.placed.get(&view.keyframe_id);
             let factor = map_from_model.scale * given.map_or(1.0, |placed| placed.depth_factor);
             let depth = Arc::new(keyframes::rescaled(&view.depth, factor));
             let median_depth = depth.median();
             if self.has_keyframe(view.keyframe_id) {
-                self.told_again(&view, depth);
+                if self.told_again(&view, depth) {
+                    deepened.push(view.keyframe_id);
+                }
             } else if let Some(keyframe) = self.keyframes.waiting.remove(&view.keyframe_id) {
                 let (image, intrinsics) =
                     keyframes::picture(&keyframe, &view, self.params.max_side);
@@ -387,13 +388,7 @@ impl SplatMap {
         }
         self.measure_scene();
         self.prune();
-        if !fresh.is_empty() {
-            self.unsettle();
-        }
-        self.balance(fresh.len() * self.params.seeds_per_keyframe);
-        for id in &fresh {
-            self.seed_from(*id, false);
-        }
+        self.seed_all(&fresh, &deepened);
         fresh
     }
 }

@@ -216,13 +216,14 @@ impl SplatMap {
 
     /// A keyframe of which the model tells once more: more neighbours have verified its depth since, unless it is out of
     /// reach.
-    pub(super) fn told_again(&mut self, view: &View, depth: Arc<DepthMap>) {
+    /// Returns whether it had no depth before.
+    pub(super) fn told_again(&mut self, view: &View, depth: Arc<DepthMap>) -> bool {
         let Some(placed) = self.keyframes.placed.get_mut(&view.keyframe_id) else {
-            return;
+            return false;
         };
         placed.health = view.health;
         if !placed.home.is_here {
-            return;
+            return false;
         }
         if placed.lens != view.lens && !placed.keyframe.frame.image.is_hollow() {
             let max_side = self.params.max_side;
@@ -232,13 +233,19 @@ impl SplatMap {
             placed.home.copy = None;
             self.engine.set_image(placed.view_ix, image, &pinhole);
         }
-        if depth.width_px > 0 {
-            self.engine
-                .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
-            (placed.median_depth, placed.depth) = (depth.median(), depth);
-            placed.ratios = None;
-            placed.home.copy = None;
+        if depth.width_px == 0 {
+            return false;
         }
+        let is_first = placed.depth.width_px == 0;
+        if is_first {
+            placed.n_depth_looks = 0;
+        }
+        self.engine
+            .set_depth(placed.view_ix, Some(Arc::clone(&depth)));
+        (placed.median_depth, placed.depth) = (depth.median(), depth);
+        placed.ratios = None;
+        placed.home.copy = None;
+        is_first
     }
 
     /// Views to train on: in memory, not held out, and with all that they show in memory, too; in order of arrival.

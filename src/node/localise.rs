@@ -2,18 +2,20 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, anyhow, bail};
 use serde::Serialize;
 
 use crate::clock::Stopwatch;
 use crate::config::Params;
+use crate::config::track::Photometric;
 use crate::eval::frames;
 use crate::eval::report::TrackingFigures;
 use crate::eval::trajectory::write_tum;
-use crate::map::checkpoint;
-use crate::node::Stop;
+use crate::map::snapshot::Scale;
+use crate::map::{SplatMap, checkpoint};
 use crate::node::run_dir::tracking_figures;
 use crate::node::track_stage::TrackStage;
+use crate::node::{Stop, engine};
 use crate::source::Source;
 use crate::track::Tracker;
 
@@ -38,7 +40,8 @@ pub fn localise(
     out: Option<&Path>,
     stop: &Stop,
 ) -> anyhow::Result<Localisation> {
-    let landmarks = checkpoint::read(map)?.landmarks;
+    let saved = checkpoint::read(map)?;
+    let landmarks = saved.landmarks.clone();
     if landmarks.is_empty() {
         bail!(
             "the map holds no landmarks to find a place by: it was written with track.enabled=false or by an older version; map again: {}",
@@ -49,9 +52,20 @@ pub fn localise(
         .map_err(anyhow::Error::msg)
         .with_context(|| format!("cannot find a place in {}", map.display()))?;
     let map_keyframes = tracker.n_keyframes();
+    let mut splats = if params.track.photometric == Photometric::Always {
+        let engine = engine(params.backend, params.deterministic)?;
+        let empty = SplatMap::new(params.map.clone(), params.seed, Scale::UP_TO_SCALE, engine);
+        let loaded = empty.continued(saved, &params.track);
+        Some(loaded.map_err(|reason| anyhow!("cannot look at {}: {reason}", map.display()))?)
+    } else {
+        None
+    };
     let mut stage = TrackStage::of(Some(tracker), false);
     while let Some(frame) = source.next().filter(|_| !stop.is_asked()) {
         stage.track(&frame, &Stopwatch::start());
+        if let Some(splats) = &mut splats {
+            stage.fit(&mut |placement| splats.fit_placement(placement, &frame));
+        }
     }
     let tracking = stage.finish(0);
     let tracks = &tracking.tracks.frames;

@@ -3,9 +3,12 @@
 //! The end of the input is the only way to end: each stage ends when its queue does. Ctrl-C tells the source alone.
 
 pub mod autosave;
+mod fitting;
+mod geometry_stage;
 pub mod localise;
 mod opening;
 mod outward;
+mod pace;
 pub mod pipeline;
 pub mod ros2;
 pub mod run_dir;

@@ -5,14 +5,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::clock::Stopwatch;
+use crate::config::track::Photometric;
 use crate::frame::Batch;
 use crate::geometry::{GeometryError, GeometryModel};
 use crate::map::snapshot::{Scale, Snapshot};
+use crate::node::fitting;
+use crate::node::geometry_stage::{GeometryStage, GeometryTally, run_geometry};
 use crate::node::opening;
 use crate::node::outward::{self, Complaints, run_live, run_publisher};
 use crate::node::source_stage::SourceStage;
-use crate::node::stages::{GeometryStage, GeometryTally, MapStage, SelectStage};
-use crate::node::threads::{Answer, joined, run_geometry, run_select, run_source};
+use crate::node::stages::{MapStage, SelectStage};
+use crate::node::threads::{Answer, joined, run_select, run_source};
 use crate::node::track_stage::{News, TrackStage, Tracking, run_track};
 use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::publish::outbox::Outbox;
@@ -75,15 +78,20 @@ fn run_with(
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let opening::Opened {
-        map,
-        track,
+        mut map,
+        mut track,
         first_id,
     } = opening::open(&job, scale, calls)?;
+    let fits = job.params.track.photometric != Photometric::Off;
+    if job.is_live && fits && track.is_on() {
+        let (asker, fitter) = fitting::pair();
+        (track.asker, map.fitter) = (Some(asker), Some(fitter));
+    }
     let outbox = job.outbox;
     let stages = Stages {
         map,
         select: SelectStage::new(&job.params, first_id),
-        geometry: GeometryStage::new(model),
+        geometry: GeometryStage::new(model, &job.params),
         track: track.heard(outbox.is_some()),
         source: SourceStage::new(job.source, job.stop, outbox.clone()),
         outbox,
@@ -185,11 +193,7 @@ impl Stages {
         is_live: bool,
         on_progress: &mut dyn FnMut(Progress),
     ) -> anyhow::Result<End> {
-        let when_full = if is_live {
-            WhenFull::DropOldest
-        } else {
-            WhenFull::Wait
-        };
+        let when_full = when_full(is_live);
         let (frames_tx, frames) = queue("frames", FRAME_QUEUE, when_full);
         let (batches_tx, batches) = queue("batches", 1, WhenFull::Wait);
         let (answers_tx, answers) = queue("answers", 1, WhenFull::Wait);
@@ -218,11 +222,14 @@ impl Stages {
         let source = spawn("source", move || {
             run_source(self.source, &frames_tx, from_source.as_ref())
         })?;
+        let pace = is_live.then(|| Arc::new(self.geometry.pace()));
+        let paced = pace.clone();
         let select = spawn("select", move || {
-            run_select(self.select, &frames, &batches_tx, from_select.as_ref())
+            let (heard, pace) = (from_select.as_ref(), paced.as_deref());
+            run_select(self.select, &frames, &batches_tx, heard, pace)
         })?;
         let geometry = spawn("geometry", move || {
-            run_geometry(self.geometry, &batches, &answers_tx)
+            run_geometry(self.geometry, &batches, &answers_tx, pace.as_deref())
         })?;
         let map = spawn("map", move || {
             let mut publish = |snapshot, progress: Progress| {
@@ -270,6 +277,15 @@ impl Stages {
             snapshot,
             error: error.map(|e| format!("geometry: {e}")),
         })
+    }
+}
+
+/// Live input is worth nothing once it is old; of a replay nothing is lost.
+fn when_full(is_live: bool) -> WhenFull {
+    if is_live {
+        WhenFull::DropOldest
+    } else {
+        WhenFull::Wait
     }
 }
 

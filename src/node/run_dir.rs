@@ -335,6 +335,7 @@ pub(super) fn tracking_figures(tracking: &Tracking, rows: &[FrameRow]) -> Tracki
         interpolated: n_known(&[Known::Interpolated]),
         lost: tracking.tracks.n_lost,
         relocalised: tracking.tracks.n_relocalised,
+        fitted: tracking.tracks.n_fitted,
         work_ms_p50: work_ms(0.5),
         work_ms_p95: work_ms(0.95),
     }

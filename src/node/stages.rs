@@ -1,16 +1,17 @@
 //! The stages between the queues: each is a struct with push-like methods and knows no threads.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use crate::clock::{Stamp, Stopwatch};
 use crate::config::{MapParams, Params};
 use crate::frame::{Batch, Frame};
-use crate::geometry::{GeometryBatch, GeometryError, GeometryModel};
+use crate::geometry::GeometryBatch;
 use crate::map::SplatMap;
 use crate::map::schedule::{self, Phase};
 use crate::map::snapshot::Snapshot;
 use crate::node::autosave::Autosave;
+use crate::node::fitting::Fitter;
 use crate::node::outward::Clerk;
 use crate::node::{Progress, Stop};
 use crate::pose::Rigid;
@@ -21,6 +22,8 @@ use crate::select::{Batcher, Selector};
 const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
+/// The same live, where a keyframe waits for them.
+const LIVE_STEPS_AT_ONCE: u64 = 2;
 /// Seconds that geometry gets to end after a stop.
 const SECS_AFTER_STOP: f64 = 0.7;
 /// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
@@ -36,19 +39,6 @@ pub(super) struct SelectStage {
     pub(super) truth: Vec<(Stamp, Rigid)>,
 }
 
-/// Batches -> geometry.
-pub(super) struct GeometryStage {
-    model: Box<dyn GeometryModel>,
-    tally: Arc<Mutex<GeometryTally>>,
-}
-
-/// What geometry leaves behind, even where it was given up at a batch.
-#[derive(Debug, Clone, Default)]
-pub(super) struct GeometryTally {
-    pub(super) secs: f64,
-    pub(super) note: Option<String>,
-}
-
 /// Geometry -> the map, its steps and its snapshots.
 pub(super) struct MapStage {
     pub(super) map: SplatMap,
@@ -57,6 +47,8 @@ pub(super) struct MapStage {
     stop: Stop,
     n_frames: Option<u64>,
     pub(super) clerk: Clerk,
+    /// Live: frames of the tracker to look at while there is nothing else to do.
+    pub(super) fitter: Option<Fitter>,
     outbox: Option<Arc<Outbox>>,
     /// Age of keyframes that no snapshot has shown.
     unpublished: BTreeMap<u32, Stopwatch>,
@@ -93,57 +85,14 @@ impl SelectStage {
         self.batcher.push(keyframe)
     }
 
+    /// Keyframes that were in no batch so far.
+    pub(super) fn n_new(&self) -> usize {
+        self.batcher.n_new()
+    }
+
+    /// A batch that is not full; `None` when every keyframe has been in one.
     pub(super) fn finish(&mut self) -> Option<Batch> {
         self.batcher.finish()
-    }
-}
-
-impl GeometryStage {
-    pub(super) fn new(model: Box<dyn GeometryModel>) -> Self {
-        Self {
-            model,
-            tally: Arc::default(),
-        }
-    }
-
-    pub(super) fn tally(&self) -> Arc<Mutex<GeometryTally>> {
-        Arc::clone(&self.tally)
-    }
-
-    pub(super) fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
-        let watch = Stopwatch::start();
-        let geometry = self.model.infer(batch);
-        self.account(&watch, geometry)
-    }
-
-    pub(super) fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
-        let watch = Stopwatch::start();
-        let geometry = self.model.finish();
-        self.account(&watch, geometry)
-    }
-
-    fn account(
-        &self,
-        watch: &Stopwatch,
-        geometry: Result<GeometryBatch, GeometryError>,
-    ) -> Result<GeometryBatch, GeometryError> {
-        let mut tally = self.tally.lock().unwrap_or_else(PoisonError::into_inner);
-        tally.secs += watch.secs();
-        if let Ok(geometry) = &geometry {
-            tracing::info!(
-                "batch {}: {} views, {} revised{}",
-                geometry.batch_id,
-                geometry.views.len(),
-                geometry.revised.len(),
-                geometry
-                    .note
-                    .as_ref()
-                    .map(|n| format!(", {n}"))
-                    .unwrap_or_default()
-            );
-            tally.note = geometry.note.clone().or(tally.note.take());
-        }
-        geometry
     }
 }
 
@@ -163,6 +112,7 @@ impl MapStage {
             clerk: Clerk::new(calls, &params.track, stop.clone()),
             stop,
             n_frames,
+            fitter: None,
             outbox,
             unpublished: BTreeMap::new(),
             autosave: None,
@@ -199,6 +149,7 @@ impl MapStage {
         for id in self.map.add(batch, geometry, progress) {
             if let Some(age) = self.unpublished.get(&id) {
                 let secs = age.secs();
+                tracing::debug!("keyframe {id} has its pose after {secs:.2} s");
                 self.keyframe_to_pose_secs.push(secs);
                 if let Some(outbox) = &self.outbox {
                     outbox.note(|standing| standing.keyframe_to_pose.note(secs));
@@ -222,7 +173,7 @@ impl MapStage {
             return false;
         }
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
-        let target = (self.map.n_steps() + STEPS_AT_ONCE).min(cap);
+        let target = (self.map.n_steps() + LIVE_STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
         self.step_until(target, publish);
         self.map.n_steps() > before
@@ -254,9 +205,12 @@ impl MapStage {
         snapshot
     }
 
-    /// Calls from outside, while nothing else is to be done.
+    /// Calls from outside and frames of the tracker, while nothing else is to be done.
     pub(super) fn serve(&mut self) {
         self.clerk.serve(&mut self.map);
+        if let Some(fitter) = &self.fitter {
+            fitter.fit_one(&mut self.map);
+        }
     }
 
     /// After a stop, geometry gets a moment for the batch that it is at, and no more: a network can take minutes.

@@ -5,13 +5,14 @@ use std::collections::VecDeque;
 use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::frame::Frame;
+use crate::node::fitting::Asker;
 use crate::node::outward::LiveEvent;
 use crate::pose::Rigid;
 use crate::pose::Similarity;
 use crate::publish::overview::SeenKeyframe;
 use crate::publish::world::LiveFrame;
 use crate::queue::{Receiver, Sender};
-use crate::track::{KeyframeView, State, TrackedFrame, Tracker, Tracks};
+use crate::track::{FramePlace, KeyframeView, State, TrackedFrame, Tracker, Tracks};
 
 /// Times that the figures of a run are made from: those of the last two hours at 15 Hz.
 const MAX_TIMES: usize = 100_000;
@@ -52,6 +53,8 @@ pub(super) struct TrackStage {
     /// What is to be said outside; kept empty where nobody listens.
     events: Vec<LiveEvent>,
     is_heard: bool,
+    /// Who finds where pictures fit the splats.
+    pub(super) asker: Option<Asker>,
 }
 
 /// What tracking leaves behind.
@@ -88,6 +91,7 @@ impl TrackStage {
             shown: None,
             events: Vec::new(),
             is_heard: false,
+            asker: None,
         }
     }
 
@@ -139,7 +143,14 @@ impl TrackStage {
             return;
         };
         let watch = Stopwatch::start();
+        let fitted = self.asker.as_ref().and_then(Asker::answer);
+        if let Some((placement, key_from_cam)) = fitted {
+            tracker.fitted(&placement, key_from_cam);
+        }
         let tracked = tracker.track(frame);
+        if let Some((asker, placement)) = self.asker.as_ref().zip(tracker.placement()) {
+            asker.ask(placement, frame);
+        }
         self.secs += watch.secs();
         note(&mut self.frame_secs, watch.secs());
         if self.is_live && tracked.is_measured() {
@@ -155,6 +166,16 @@ impl TrackStage {
                 moved,
                 latency_secs: since.secs(),
             })));
+        }
+    }
+
+    /// Asks for a better pose of the last frame, relative to the keyframe that it was tracked by.
+    pub(super) fn fit(&mut self, better: &mut dyn FnMut(&FramePlace) -> Option<Rigid>) {
+        if let Some(tracker) = &mut self.tracker
+            && let Some(placement) = tracker.placement()
+            && let Some(key_from_cam) = better(&placement)
+        {
+            tracker.fitted(&placement, key_from_cam);
         }
     }
 

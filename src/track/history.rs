@@ -35,12 +35,16 @@ pub struct Tracks {
     /// Times that the tracker got lost, and was found again without a hint.
     pub n_lost: u64,
     pub n_relocalised: u64,
+    /// Frames whose last pose is that at which their picture fits the splats best.
+    pub n_fitted: u64,
 }
 
 #[derive(Debug)]
 pub(super) struct Kept {
     track: FrameTrack,
     pub(super) anchor: Option<Anchor>,
+    /// The map was looked at to find where its picture fits.
+    pub(super) is_fitted: bool,
 }
 
 #[derive(Debug, Default)]
@@ -79,13 +83,19 @@ impl History {
         if self.frames.len() > MAX_FRAMES {
             self.frames.truncate(MAX_FRAMES);
         }
-        self.frames.push(Kept { track, anchor });
+        self.frames.push(Kept {
+            track,
+            anchor,
+            is_fitted: false,
+        });
         self.frames.len() - 1
     }
 
     pub(super) fn into_tracks(self, mut frames: Vec<FrameTrack>) -> Tracks {
         frames.truncate(MAX_FRAMES);
+        let fitted = self.frames.iter().filter(|frame| frame.is_fitted);
         Tracks {
+            n_fitted: fitted.count() as u64,
             frames,
             n_frames: self.n_frames,
             n_tracked: self.n_tracked,

@@ -4,6 +4,7 @@
 //! bits alone where there is no motion to go by. Reads copies of what the map knows; tells the map nothing.
 
 mod fit;
+mod fitted;
 mod history;
 mod landmarks;
 mod locate;
@@ -17,6 +18,7 @@ use std::sync::Arc;
 
 use nalgebra::Matrix6;
 
+pub use self::fitted::FramePlace;
 use self::history::History;
 pub use self::history::{FrameTrack, Tracks};
 pub use self::landmarks::KeyframeView;
@@ -324,6 +326,9 @@ impl Tracker {
     fn second_look(&mut self, waiting: &Waiting) {
         let frame = &self.history.frames[waiting.history_ix];
         let id = self.keyframe_of(waiting.seen.seq);
+        if id.is_none() && frame.is_fitted {
+            return;
+        }
         let anchor = if let Some(id) = id {
             // The frame is a keyframe, whose pose the map knows best.
             Some(Anchor {

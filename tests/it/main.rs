@@ -49,6 +49,7 @@ mod onnx_models;
 mod onnx_node;
 mod opening;
 mod over_zenoh;
+mod photometric;
 mod pictures;
 mod publish;
 mod recordings;

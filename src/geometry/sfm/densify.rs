@@ -1,6 +1,6 @@
 //! Placed keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use super::report::{SparseBatch, SparseView};
@@ -10,12 +10,14 @@ use crate::frame::{DepthMap, RgbImage};
 use crate::geometry::mvs::MvsView;
 use crate::geometry::mvs::neighbours::depth_range;
 use crate::geometry::mvs::state::MvsState;
-use crate::geometry::{GeometryBatch, PoseError, Sightings, View};
+use crate::geometry::{GeometryBatch, PoseError, Revision, Sightings, View};
 use crate::gpu::GpuError;
 use crate::source::rectify::Rectifier;
 
 /// Pictures and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 32;
+/// Views that wait for a better depth, the newest.
+const MAX_AGAIN: usize = 4;
 /// Poses that moved its pixels by more since the sweep make a depth map out of date.
 const MAX_DRIFT_PX: f64 = 1.0;
 
@@ -26,6 +28,9 @@ pub(super) struct Densifier {
     state: MvsState,
     /// Of all views so far: the lens by which the picture was straightened.
     lenses: BTreeMap<u32, Option<Lens>>,
+    /// Views whose poses were told: those without depth, and those whose depth may be better by now.
+    waiting: VecDeque<SparseView>,
+    again: VecDeque<SparseView>,
 }
 
 impl Densifier {
@@ -34,6 +39,8 @@ impl Densifier {
             params: params.clone(),
             state: MvsState::new(params.clone(), MAX_HELD)?,
             lenses: BTreeMap::new(),
+            waiting: VecDeque::new(),
+            again: VecDeque::new(),
         })
     }
 
@@ -43,17 +50,10 @@ impl Densifier {
         sparse: SparseBatch,
         image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
     ) -> GeometryBatch {
-        for revision in &sparse.revised {
-            let id = revision.keyframe_id;
-            if self.state.holds(id) {
-                self.state
-                    .revise(id, revision.intrinsics, revision.batch_from_cam);
-            }
-        }
-        // All pictures first: the views of one batch are each other's best sources.
-        for view in &sparse.views {
-            self.hold(view, image_of);
-        }
+        self.take_in(&sparse, image_of);
+        // The scene as it is now tells of all that still waits.
+        self.waiting.clear();
+        self.again.clear();
         for view in &sparse.views {
             self.sweep(view);
         }
@@ -67,6 +67,77 @@ impl Densifier {
             is_loop: sparse.is_loop,
             sightings,
             note: sparse.note,
+        }
+    }
+
+    /// The poses of a batch; its depth comes by `next`.
+    pub(super) fn poses(
+        &mut self,
+        sparse: SparseBatch,
+        image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
+    ) -> GeometryBatch {
+        self.take_in(&sparse, image_of);
+        for revision in &sparse.revised {
+            let waiting = self.waiting.iter_mut().chain(&mut self.again);
+            for view in waiting.filter(|view| view.keyframe_id == revision.keyframe_id) {
+                move_to(view, revision);
+            }
+        }
+        let views = sparse.views.iter();
+        let told = GeometryBatch {
+            pose_error: PoseError::default(),
+            batch_id: sparse.batch_id,
+            views: views.map(|view| placed(view, DepthMap::none())).collect(),
+            revised: sparse.revised,
+            is_loop: sparse.is_loop,
+            sightings: sparse.views.iter().map(sightings).collect(),
+            note: sparse.note,
+        };
+        for view in sparse.views {
+            let is_other = |other: &SparseView| other.keyframe_id != view.keyframe_id;
+            self.waiting.retain(is_other);
+            self.again.retain(is_other);
+            if self.state.n_sources(view.keyframe_id) == 0 {
+                self.waiting.push_back(view);
+            } else {
+                self.again.push_back(view);
+            }
+        }
+        while self.again.len() > MAX_AGAIN {
+            self.again.pop_front();
+        }
+        while self.waiting.len() > MAX_HELD {
+            self.waiting.pop_front();
+        }
+        told
+    }
+
+    /// Views without depth so far.
+    pub(super) fn n_waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// One more view with depth, of those whose poses were told.
+    pub(super) fn next(&mut self) -> Option<View> {
+        let view = self
+            .waiting
+            .pop_front()
+            .or_else(|| self.again.pop_front())?;
+        self.sweep(&view);
+        Some(self.view(&view))
+    }
+
+    fn take_in(&mut self, sparse: &SparseBatch, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
+        for revision in &sparse.revised {
+            let id = revision.keyframe_id;
+            if self.state.holds(id) {
+                self.state
+                    .revise(id, revision.intrinsics, revision.batch_from_cam);
+            }
+        }
+        // All pictures first: the views of one batch are each other's best sources.
+        for view in &sparse.views {
+            self.hold(view, image_of);
         }
     }
 
@@ -127,18 +198,32 @@ impl Densifier {
     }
 
     fn view(&self, view: &SparseView) -> View {
-        View {
-            keyframe_id: view.keyframe_id,
-            component: view.component,
-            intrinsics: view.intrinsics,
-            lens: view.lens,
-            batch_from_cam: view.batch_from_cam,
-            depth: self
-                .state
-                .depth_of(view.keyframe_id)
-                .unwrap_or_else(DepthMap::none),
-            health: view.health,
-        }
+        let depth = self.state.depth_of(view.keyframe_id);
+        placed(view, depth.unwrap_or_else(DepthMap::none))
+    }
+}
+
+/// Its landmarks stay where they are before the camera.
+fn move_to(view: &mut SparseView, revision: &Revision) {
+    let old = view.batch_from_cam.inverse();
+    for landmark in &mut view.landmarks {
+        let in_cam = old.transform_point(landmark.point_in_batch) * revision.depth_factor;
+        landmark.point_in_batch = revision.batch_from_cam.transform_point(in_cam);
+    }
+    view.component = revision.component;
+    view.intrinsics = revision.intrinsics;
+    view.batch_from_cam = revision.batch_from_cam;
+}
+
+fn placed(view: &SparseView, depth: DepthMap) -> View {
+    View {
+        keyframe_id: view.keyframe_id,
+        component: view.component,
+        intrinsics: view.intrinsics,
+        lens: view.lens,
+        batch_from_cam: view.batch_from_cam,
+        depth,
+        health: view.health,
     }
 }
 

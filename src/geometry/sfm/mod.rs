@@ -335,9 +335,32 @@ impl Sfm {
 }
 
 impl GeometryModel for Sfm {
+    fn takes_small_batches(&self) -> bool {
+        true
+    }
+
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.sparse(batch);
         Ok(self.densify(sparse))
+    }
+
+    fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
+        let sparse = self.sparse(batch);
+        let scene = &self.scene;
+        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+    }
+
+    fn depth(&mut self) -> Option<GeometryBatch> {
+        let view = self.densifier.next()?;
+        Some(GeometryBatch {
+            batch_id: self.batch_id,
+            views: vec![view],
+            ..GeometryBatch::default()
+        })
+    }
+
+    fn n_without_depth(&self) -> usize {
+        self.densifier.n_waiting()
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {

@@ -1,0 +1,141 @@
+//! Live: when keyframes go to geometry, so that each has its pose soon.
+//!
+//! Poses of few keyframes take a fraction of what their depth takes, and need not wait for it. Where keyframes
+//! come faster than depth does, selection waits, and frames are dropped and counted.
+
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+/// Keyframes that the first poses are made from: fewer can agree on a wrong place.
+const FIRST: usize = 5;
+/// Keyframes that may wait in selection while geometry takes none: the next is better chosen when it does.
+const MOST: usize = 1;
+/// Keyframes with a pose whose depth may be outstanding when more are taken. The newest gets its depth first, so that
+/// nobody waits for these; at the start they keep the chain of keyframes from breaking.
+const MAX_WITHOUT_DEPTH: usize = 8;
+
+/// Told by geometry, asked by selection.
+#[derive(Debug)]
+pub(super) struct Pace {
+    /// What the model says of itself; else only full batches are of use.
+    takes_small: bool,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// There are keyframes that new ones can be placed by.
+    has_placed: bool,
+    n_without_depth: usize,
+    /// A batch is on its way or at work.
+    is_sent: bool,
+    has_ended: bool,
+}
+
+impl State {
+    fn is_open(&self) -> bool {
+        !self.is_sent && self.n_without_depth <= MAX_WITHOUT_DEPTH
+    }
+}
+
+impl Pace {
+    pub(super) fn new(takes_small: bool) -> Self {
+        Self {
+            takes_small,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        }
+    }
+
+    /// Whether a batch of `n_new` new keyframes should go out before it is full.
+    pub(super) fn is_due(&self, n_new: usize) -> bool {
+        let state = self.lock();
+        self.takes_small
+            && if state.has_placed {
+                n_new >= MOST || n_new > 0 && state.is_open()
+            } else {
+                n_new >= FIRST
+            }
+    }
+
+    /// Selection: waits until geometry takes a batch, which it is about to send. `false`: it takes none any more.
+    pub(super) fn wait_to_send(&self) -> bool {
+        let is_shut = |state: &mut State| !state.is_open() && !state.has_ended;
+        let state = self.changed.wait_while(self.lock(), is_shut);
+        let mut state = state.unwrap_or_else(PoisonError::into_inner);
+        state.is_sent = true;
+        !state.has_ended
+    }
+
+    /// Geometry: how it stands.
+    pub(super) fn note(&self, has_placed: bool, n_without_depth: usize) {
+        let mut state = self.lock();
+        (state.has_placed, state.n_without_depth) = (has_placed, n_without_depth);
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Geometry: the batch that it took is done.
+    pub(super) fn done(&self) {
+        self.lock().is_sent = false;
+        self.changed.notify_all();
+    }
+
+    /// Geometry takes no more.
+    pub(super) fn end(&self) {
+        self.lock().has_ended = true;
+        self.changed.notify_all();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[test]
+    fn a_start_takes_some_keyframes_and_then_each_goes_out_at_once() {
+        let pace = Pace::new(true);
+        assert!(!pace.is_due(FIRST - 1) && pace.is_due(FIRST));
+        pace.note(false, 0);
+        assert!(!pace.is_due(1), "nothing was placed");
+        pace.note(true, 0);
+        assert!(pace.is_due(1) && !pace.is_due(0));
+        pace.note(true, MAX_WITHOUT_DEPTH + 1);
+        assert!(pace.is_due(MOST), "selection waits with so many");
+    }
+
+    #[test]
+    fn selection_waits_while_depth_is_behind_and_ends_with_geometry() {
+        let pace = Arc::new(Pace::new(true));
+        pace.note(true, MAX_WITHOUT_DEPTH + 1);
+        let (told_tx, told) = std::sync::mpsc::sync_channel(2);
+        let waiting = Arc::clone(&pace);
+        let thread = crate::node::spawn("waiting", move || {
+            for _ in 0..2 {
+                told_tx.send(waiting.wait_to_send()).unwrap();
+            }
+        })
+        .unwrap();
+        let soon = std::time::Duration::from_millis(50);
+        assert!(told.recv_timeout(soon).is_err());
+        pace.note(true, 0);
+        assert_eq!(told.recv(), Ok(true));
+        assert!(told.recv_timeout(soon).is_err(), "the first is at work");
+        pace.end();
+        assert_eq!(told.recv(), Ok(false));
+        thread.join().unwrap();
+    }
+
+    #[test]
+    fn a_network_gets_full_batches() {
+        let pace = Pace::new(false);
+        pace.note(true, 0);
+        assert!((1..100).all(|n_new| !pace.is_due(n_new)));
+    }
+}
