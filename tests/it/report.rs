@@ -68,6 +68,7 @@ timing_s.optimise
 timing_s.track
 timing_s.wall
 tracking.dropped
+tracking.fitted
 tracking.frames
 tracking.interpolated
 tracking.lost
