@@ -9,8 +9,8 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 const FIRST: usize = 5;
 /// Keyframes that may wait in selection while geometry takes none: the next is better chosen when it does.
 const MOST: usize = 1;
-/// Keyframes with a pose whose depth may be outstanding when more are taken. The newest gets its depth first, so that
-/// nobody waits for these; at the start they keep the chain of keyframes from breaking.
+/// Keyframes with a pose whose depth may be outstanding when more are taken: at the start they keep the chain of
+/// keyframes from breaking. Depth comes in their order, so that the newest may wait for as many.
 const MAX_WITHOUT_DEPTH: usize = 8;
 
 /// Told by geometry, asked by selection.

@@ -117,7 +117,7 @@ impl Densifier {
         self.waiting.len()
     }
 
-    /// One more view with depth, of those whose poses were told.
+    /// One more view with depth, of those whose poses were told: the oldest.
     pub(super) fn next(&mut self) -> Option<View> {
         let view = self
             .waiting
