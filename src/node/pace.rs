@@ -7,8 +7,6 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 /// Keyframes that the first poses are made from: fewer can agree on a wrong place.
 const FIRST: usize = 5;
-/// Keyframes that may wait in selection while geometry takes none: the next is better chosen when it does.
-const MOST: usize = 1;
 /// Keyframes with a pose whose depth may be outstanding when more are taken: at the start they keep the chain of
 /// keyframes from breaking. Depth comes in their order, so that the newest may wait for as many.
 const MAX_WITHOUT_DEPTH: usize = 8;
@@ -49,13 +47,9 @@ impl Pace {
 
     /// Whether a batch of `n_new` new keyframes should go out before it is full.
     pub(super) fn is_due(&self, n_new: usize) -> bool {
-        let state = self.lock();
-        self.takes_small
-            && if state.has_placed {
-                n_new >= MOST || n_new > 0 && state.is_open()
-            } else {
-                n_new >= FIRST
-            }
+        // Once there is a map, selection waits with a single one: the next is better chosen when geometry takes it.
+        let least = if self.lock().has_placed { 1 } else { FIRST };
+        self.takes_small && n_new >= least
     }
 
     /// Selection: waits until geometry takes a batch, which it is about to send. `false`: it takes none any more.
@@ -107,7 +101,7 @@ mod tests {
         pace.note(true, 0);
         assert!(pace.is_due(1) && !pace.is_due(0));
         pace.note(true, MAX_WITHOUT_DEPTH + 1);
-        assert!(pace.is_due(MOST), "selection waits with so many");
+        assert!(pace.is_due(1), "selection waits with so many");
     }
 
     #[test]

@@ -47,27 +47,15 @@ impl Densifier {
     /// `image_of` gives the picture of a keyframe.
     pub(super) fn densify(
         &mut self,
-        sparse: SparseBatch,
+        sparse: &SparseBatch,
         image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
     ) -> GeometryBatch {
-        self.take_in(&sparse, image_of);
-        // The scene as it is now tells of all that still waits.
-        self.waiting.clear();
-        self.again.clear();
+        self.take_in(sparse, image_of);
         for view in &sparse.views {
             self.sweep(view);
         }
         let views = sparse.views.iter().map(|view| self.view(view)).collect();
-        let sightings = sparse.views.iter().map(sightings).collect();
-        GeometryBatch {
-            pose_error: PoseError::default(),
-            batch_id: sparse.batch_id,
-            views,
-            revised: sparse.revised,
-            is_loop: sparse.is_loop,
-            sightings,
-            note: sparse.note,
-        }
+        told(sparse, views)
     }
 
     /// The poses of a batch; its depth comes by `next`.
@@ -83,16 +71,8 @@ impl Densifier {
                 move_to(view, revision);
             }
         }
-        let views = sparse.views.iter();
-        let told = GeometryBatch {
-            pose_error: PoseError::default(),
-            batch_id: sparse.batch_id,
-            views: views.map(|view| placed(view, DepthMap::none())).collect(),
-            revised: sparse.revised,
-            is_loop: sparse.is_loop,
-            sightings: sparse.views.iter().map(sightings).collect(),
-            note: sparse.note,
-        };
+        let without_depth = |view| placed(view, DepthMap::none());
+        let told = told(&sparse, sparse.views.iter().map(without_depth).collect());
         for view in sparse.views {
             let is_other = |other: &SparseView| other.keyframe_id != view.keyframe_id;
             self.waiting.retain(is_other);
@@ -200,6 +180,18 @@ impl Densifier {
     fn view(&self, view: &SparseView) -> View {
         let depth = self.state.depth_of(view.keyframe_id);
         placed(view, depth.unwrap_or_else(DepthMap::none))
+    }
+}
+
+fn told(sparse: &SparseBatch, views: Vec<View>) -> GeometryBatch {
+    GeometryBatch {
+        pose_error: PoseError::default(),
+        batch_id: sparse.batch_id,
+        views,
+        revised: sparse.revised.clone(),
+        is_loop: sparse.is_loop,
+        sightings: sparse.views.iter().map(sightings).collect(),
+        note: sparse.note.clone(),
     }
 }
 

@@ -328,7 +328,7 @@ impl Sfm {
         }
     }
 
-    fn densify(&mut self, sparse: SparseBatch) -> GeometryBatch {
+    fn densify(&mut self, sparse: &SparseBatch) -> GeometryBatch {
         let scene = &self.scene;
         self.densifier.densify(sparse, &|id| scene.image_of(id))
     }
@@ -341,7 +341,7 @@ impl GeometryModel for Sfm {
 
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.sparse(batch);
-        Ok(self.densify(sparse))
+        Ok(self.densify(&sparse))
     }
 
     fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
@@ -365,6 +365,6 @@ impl GeometryModel for Sfm {
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.finish_sparse();
-        Ok(self.densify(sparse))
+        Ok(self.densify(&sparse))
     }
 }

@@ -61,6 +61,6 @@ impl PosedStereo {
             batch_id: self.sfm.batch_id,
             ..sparse
         };
-        self.sfm.densify(sparse)
+        self.sfm.densify(&sparse)
     }
 }
