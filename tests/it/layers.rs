@@ -115,6 +115,7 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("libc", &["src/source/v4l2/"][..]),
         ("nokhwa", &["src/source/webcam.rs"][..]),
         ("zune_jpeg", &["src/source/jpeg.rs"][..]),
+        ("wide", &["src/source/jpeg/"][..]),
         ("fast_image_resize", &["src/frame.rs", "src/source/"][..]),
         (
             "kornia_imgproc",
