@@ -114,6 +114,29 @@ impl DepthMap {
         }
     }
 
+    /// So many pixels of it, each from the middle of what it stands for.
+    pub fn thinned(&self, width_px: u32, height_px: u32) -> Self {
+        let (from, to) = ([self.width_px, self.height_px], [width_px, height_px]);
+        let middle = |ix: u32, side: usize| {
+            let doubled = u64::from(2 * ix + 1) * u64::from(from[side]);
+            (doubled / u64::from(2 * to[side])) as usize
+        };
+        let places: Vec<usize> = (0..height_px)
+            .flat_map(|y| (0..width_px).map(move |x| (x, y)))
+            .map(|(x, y)| middle(y, 1) * from[0] as usize + middle(x, 0))
+            .collect();
+        let picked = |values: &[f32]| {
+            let value = |&at: &usize| values.get(at).copied().unwrap_or(0.0);
+            places.iter().map(value).collect()
+        };
+        Self {
+            width_px,
+            height_px,
+            depth: picked(&self.depth),
+            confidence: picked(&self.confidence),
+        }
+    }
+
     /// Depth and confidence of pixel `at`; `None` where no depth was verified.
     pub fn verified(&self, at: usize) -> Option<(f32, f32)> {
         let (depth, confidence) = (*self.depth.get(at)?, *self.confidence.get(at)?);

@@ -189,6 +189,7 @@ impl SplatMap {
         });
         let fresh = self.place(own, geometry.pose_error);
         self.hold_keyframes(0);
+        self.thin_old_depth();
         self.match_views();
         self.set_gauge();
         self.note_peaks();

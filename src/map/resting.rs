@@ -1,6 +1,7 @@
 //! More keyframes than the budget allows -> pictures and depth of some leave memory, and come back to be trained on.
 //!
-//! A keyframe that leaves keeps its place, its camera and its splats. The newest stay; the others take turns.
+//! A keyframe that leaves keeps its place, its camera and its splats. The newest stay; the others take turns. Before that,
+//! depth of all but the newest is thinned.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -17,6 +18,8 @@ use crate::map::spill::{Slot, Spill};
 /// The newest keyframes that never rest and, of those that memory has room for, the share that is for the newest.
 const N_NEWEST: usize = 8;
 const NEWEST_SHARE: f64 = 0.5;
+/// The newest keyframes whose depth is whole. The model may still tell of them again, and it is they that seed.
+const N_WHOLE_DEPTH: usize = 32;
 /// Views may take one part of so many of `map.max_gpu_mib`; the rest is for splats.
 const VIEWS_SHARE: usize = 2;
 /// Steps between turns, and keyframes that come back in one.
@@ -103,6 +106,19 @@ impl SplatMap {
         }
         if n_over > 0 {
             self.choose_trainable();
+        }
+    }
+
+    /// Depth is most of what a keyframe takes, and behind the newest it only guides a loss.
+    pub(super) fn thin_old_depth(&mut self) {
+        let placed = self.keyframes.placed.values_mut().rev();
+        for placed in placed.skip(N_WHOLE_DEPTH) {
+            let depth = &placed.depth;
+            if depth.width_px.max(depth.height_px) > saved_view::MAX_DEPTH_SIDE {
+                placed.depth = Arc::new(saved_view::thinned(depth));
+                let depth = Arc::clone(&placed.depth);
+                self.engine.set_depth(placed.view_ix, Some(depth));
+            }
         }
     }
 

@@ -17,7 +17,7 @@ use crate::source::decode;
 
 /// Errors of a JPEG at this quality are below 40 dB, those of a map at 25 to 30 dB.
 const JPEG_QUALITY: u8 = 92;
-const MAX_DEPTH_SIDE: u32 = 160;
+pub const MAX_DEPTH_SIDE: u32 = 160;
 /// Largest code of a depth; 0 is none.
 const MAX_CODE: f32 = 65_534.0;
 /// `decode::depth_png` gives thousandths.
@@ -142,6 +142,17 @@ pub fn unpack(bytes: &[u8], size_px: (u32, u32)) -> Result<(RgbImage, DepthMap),
     Ok((image, depth))
 }
 
+/// No longer than `MAX_DEPTH_SIDE`.
+pub fn thinned(map: &DepthMap) -> DepthMap {
+    let longest = f64::from(map.width_px.max(map.height_px));
+    let share = (longest / f64::from(MAX_DEPTH_SIDE)).max(1.0);
+    let side = |n: u32| match n {
+        0 => 0,
+        n => ((f64::from(n) / share).round() as u32).max(1),
+    };
+    map.thinned(side(map.width_px), side(map.height_px))
+}
+
 /// Depth in whole numbers.
 struct Codes {
     width_px: u32,
@@ -155,6 +166,7 @@ struct Codes {
 impl Codes {
     /// Of a depth map without any value: of no size.
     fn of(map: &DepthMap) -> Self {
+        let map = thinned(map);
         let verified = (0..map.depth.len()).filter_map(|at| map.verified(at));
         let (near, far) = verified.fold((f32::INFINITY, 0.0_f32), |(near, far), (z, _)| {
             (near.min(z), far.max(z))
@@ -170,35 +182,24 @@ impl Codes {
                 confidence: Vec::new(),
             };
         }
-        let share = f64::from(w.max(h)).max(f64::from(MAX_DEPTH_SIDE)) / f64::from(MAX_DEPTH_SIDE);
-        let side = |n: u32| ((f64::from(n) / share).round() as u32).max(1);
-        let mut codes = Self {
-            width_px: side(w),
-            height_px: side(h),
+        let span = (far / near).ln().max(f32::MIN_POSITIVE);
+        let codes = (0..map.depth.len()).map(|at| {
+            map.verified(at).map_or((0, 0), |(z, confidence)| {
+                let share = (z / near).ln() / span;
+                let code = 1.0 + share * (MAX_CODE - 1.0);
+                let sure = (confidence * 255.0).round().clamp(1.0, 255.0);
+                (code.round().clamp(1.0, MAX_CODE) as u16, sure as u8)
+            })
+        });
+        let (depth, confidence) = codes.unzip();
+        Self {
+            width_px: w,
+            height_px: h,
             near,
             far,
-            depth: Vec::new(),
-            confidence: Vec::new(),
-        };
-        let span = (far / near).ln().max(f32::MIN_POSITIVE);
-        for y in 0..codes.height_px {
-            for x in 0..codes.width_px {
-                // The middle of what the small pixel stands for.
-                let at = |i: u32, small: u32, large: u32| {
-                    (u64::from(2 * i + 1) * u64::from(large) / u64::from(2 * small)) as usize
-                };
-                let from = at(y, codes.height_px, h) * w as usize + at(x, codes.width_px, w);
-                let (code, sure) = map.verified(from).map_or((0, 0), |(z, confidence)| {
-                    let share = (z / near).ln() / span;
-                    let code = 1.0 + share * (MAX_CODE - 1.0);
-                    let sure = (confidence * 255.0).round().clamp(1.0, 255.0);
-                    (code.round().clamp(1.0, MAX_CODE) as u16, sure as u8)
-                });
-                codes.depth.push(code);
-                codes.confidence.push(sure);
-            }
+            depth,
+            confidence,
         }
-        codes
     }
 }
 

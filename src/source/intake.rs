@@ -194,7 +194,7 @@ impl Intake {
         let mut small = self.scaled(picture, working.size);
         let image = match &working.rectifier {
             Some(rectifier) => {
-                let mut straight = self.pool.spare();
+                let mut straight = self.pool.spare_of(small.pixels.len());
                 rectifier.rectify_into(&mut small, &mut straight);
                 self.pool.take_back(small);
                 straight
@@ -266,7 +266,8 @@ impl Intake {
         if (picture.width_px, picture.height_px) == size {
             return picture;
         }
-        let mut out = self.pool.spare();
+        let n_bytes = 3 * size.0 as usize * size.1 as usize;
+        let mut out = self.pool.spare_of(n_bytes);
         resize(&mut out, size.0, size.1);
         let source = ImageRef::new(
             picture.width_px,

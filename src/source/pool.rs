@@ -9,7 +9,8 @@ use crate::source::decode::empty;
 const MAX_LENT: usize = 12;
 /// Pictures larger than this are few, and two dozen of them would be too much to keep.
 const MAX_LENT_BYTES: usize = 4 << 20;
-const MAX_SPARE: usize = 2;
+/// One as it is decoded, and of the size that frames have those on the way through scaling and straightening.
+const MAX_SPARE: usize = 4;
 const MAX_SPARE_BYTES: usize = 32 << 20;
 
 #[derive(Debug, Default)]
@@ -21,9 +22,19 @@ pub(super) struct Pool {
 }
 
 impl Pool {
-    /// A picture to write into; its size and content are anything.
+    /// A picture to decode into, of the largest memory there is; its size and content are anything.
     pub(super) fn spare(&mut self) -> RgbImage {
-        self.spare.pop().unwrap_or_else(empty)
+        let memory = |ix: &usize| self.spare[*ix].pixels.capacity();
+        let largest = (0..self.spare.len()).max_by_key(memory);
+        largest.map_or_else(empty, |ix| self.spare.swap_remove(ix))
+    }
+
+    /// A picture to write so many bytes into. It has not much more memory than that: frames keep it for as long as they
+    /// are kept.
+    pub(super) fn spare_of(&mut self, n_bytes: usize) -> RgbImage {
+        let fits = |p: &RgbImage| (n_bytes..=n_bytes + n_bytes / 4).contains(&p.pixels.capacity());
+        let fitting = self.spare.iter().position(fits);
+        fitting.map_or_else(empty, |ix| self.spare.swap_remove(ix))
     }
 
     pub(super) fn take_back(&mut self, picture: RgbImage) {
@@ -77,6 +88,22 @@ mod tests {
         assert_eq!((held.pixels[0], third.pixels[0]), (1, 3));
         assert_eq!(Arc::as_ptr(&third), address);
         assert_eq!(pool.spare().pixels, vec![2; 6]);
+    }
+
+    #[test]
+    fn a_small_picture_does_not_sit_in_the_memory_of_a_large_one() {
+        let mut pool = Pool::default();
+        let of = |n_bytes| RgbImage {
+            pixels: Vec::with_capacity(n_bytes),
+            ..picture(0)
+        };
+        for n_bytes in [400, 110, 100] {
+            pool.take_back(of(n_bytes));
+        }
+        assert_eq!(pool.spare_of(100).pixels.capacity(), 110);
+        assert_eq!(pool.spare_of(99).pixels.capacity(), 100);
+        assert_eq!(pool.spare_of(100).pixels.capacity(), 0);
+        assert_eq!(pool.spare().pixels.capacity(), 400);
     }
 
     #[test]

@@ -297,23 +297,7 @@ fn hold(unit: f64) -> [[f64; 6]; 6] {
     hold
 }
 
-/// Every so manieth pixel.
 fn thumbnail(depth: &DepthMap) -> DepthMap {
-    let (w, h) = (depth.width_px as usize, depth.height_px as usize);
-    if w == 0 || h == 0 {
-        return DepthMap::none();
-    }
-    let (new_w, new_h) = (w.min(GRID), h.min(GRID));
-    let at = |k: usize| {
-        let (x, y) = (k % new_w, k / new_w);
-        let middle = |i: usize, n: usize, of: usize| (2 * i + 1) * of / (2 * n);
-        middle(y, new_h, h) * w + middle(x, new_w, w)
-    };
-    let picked = |values: &[f32]| (0..new_w * new_h).map(|k| values[at(k)]).collect();
-    DepthMap {
-        width_px: new_w as u32,
-        height_px: new_h as u32,
-        depth: picked(&depth.depth),
-        confidence: picked(&depth.confidence),
-    }
+    let side = |n: u32| n.min(GRID as u32);
+    depth.thinned(side(depth.width_px), side(depth.height_px))
 }
