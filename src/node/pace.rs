@@ -8,7 +8,7 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 /// Keyframes that the first poses are made from: fewer can agree on a wrong place.
 const FIRST: usize = 5;
 /// Keyframes with a pose whose depth may be outstanding when more are taken: at the start they keep the chain of
-/// keyframes from breaking. Depth comes in their order, so that the newest may wait for as many.
+/// keyframes from breaking. The newest gets its depth first, so that nobody waits for these.
 const MAX_WITHOUT_DEPTH: usize = 8;
 
 /// Told by geometry, asked by selection.

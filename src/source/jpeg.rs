@@ -63,11 +63,11 @@ impl Jpeg {
     }
 
     fn baseline_or_other(&mut self, bytes: &[u8], out: &mut RgbImage) -> Result<(), String> {
-        let Some(frame) = self.baseline.read_header(bytes) else {
+        let Some(header) = self.baseline.read_header(bytes) else {
             return decode(bytes, out);
         };
-        make_room(out, frame.width_px, frame.height_px, bytes.len())?;
-        self.baseline.decode(&frame, bytes, out)
+        make_room(out, header.width_px, header.height_px, bytes.len())?;
+        self.baseline.decode(&header, bytes, out)
     }
 }
 

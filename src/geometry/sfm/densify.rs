@@ -97,12 +97,9 @@ impl Densifier {
         self.waiting.len()
     }
 
-    /// One more view with depth, of those whose poses were told: the oldest.
+    /// One more view with depth, of those whose poses were told: the newest, since frames are tracked by it.
     pub(super) fn next(&mut self) -> Option<View> {
-        let view = self
-            .waiting
-            .pop_front()
-            .or_else(|| self.again.pop_front())?;
+        let view = self.waiting.pop_back().or_else(|| self.again.pop_front())?;
         self.sweep(&view);
         Some(self.view(&view))
     }

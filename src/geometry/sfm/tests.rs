@@ -309,6 +309,31 @@ fn two_parts_become_one_when_a_bridge_comes() {
 }
 
 #[test]
+fn parts_join_only_where_half_of_what_they_share_agrees() {
+    let (sfm, _) = run(&mut cloud(), &arc(6, -15.0, 15.0), Some(camera()));
+    let shots = &sfm.scene.components[0].shots;
+    let landmarks = sfm.scene.landmarks_of(shots);
+    // Of ten, so many are the same in both parts; the others are anything.
+    let joins = |n_same: usize| {
+        let other = |ix: usize| landmarks[(7 * ix + 100) % landmarks.len()];
+        let pairs: Vec<(u32, u32)> = (0..landmarks.len())
+            .map(|ix| {
+                (
+                    landmarks[ix],
+                    if ix % 10 < n_same {
+                        landmarks[ix]
+                    } else {
+                        other(ix)
+                    },
+                )
+            })
+            .collect();
+        merging::similarity(&sfm.scene, &pairs, &sfm.limits(&[]), 1).is_some()
+    };
+    assert_eq!([7, 6, 4, 3].map(joins), [true, true, false, false]);
+}
+
+#[test]
 fn equal_input_gives_equal_poses() {
     let poses = arc(8, 0.0, 40.0);
     let told = || {

@@ -4,7 +4,7 @@
 
 use yuv::{YuvError, YuvPlanarImage, YuvRange, YuvStandardMatrix};
 
-use super::header::{Component, Frame, Sampling, Tables};
+use super::header::{Component, Header, Sampling, Tables};
 use super::huffman::{Bits, Damage};
 use super::idct::{self, Coefficients};
 use super::tables;
@@ -44,21 +44,21 @@ pub(super) struct Baseline {
 
 impl Baseline {
     /// `None`: the picture is of another kind.
-    pub(super) fn read_header(&mut self, bytes: &[u8]) -> Option<Frame> {
-        Frame::read(bytes, &mut self.tables)
+    pub(super) fn read_header(&mut self, bytes: &[u8]) -> Option<Header> {
+        Header::read(bytes, &mut self.tables)
     }
 
     /// `out` has the picture's size.
     pub(super) fn decode(
         &mut self,
-        frame: &Frame,
+        header: &Header,
         bytes: &[u8],
         out: &mut RgbImage,
     ) -> Result<(), String> {
-        self.scan(frame, &bytes[frame.data_at..])?;
+        self.scan(header, &bytes[header.data_at..])?;
         let [luma, blue, red] = &self.planes;
-        if frame.sampling == Sampling::Grey {
-            let rows = out.pixels.chunks_exact_mut(3 * frame.width_px as usize);
+        if header.sampling == Sampling::Grey {
+            let rows = out.pixels.chunks_exact_mut(3 * header.width_px as usize);
             for (row, levels) in rows.zip(luma.levels.chunks_exact(luma.step)) {
                 for (pixel, &level) in row.as_chunks_mut::<3>().0.iter_mut().zip(levels) {
                     *pixel = [level; 3];
@@ -73,19 +73,19 @@ impl Baseline {
             u_stride: blue.step as u32,
             v_plane: &red.levels,
             v_stride: red.step as u32,
-            width: frame.width_px,
-            height: frame.height_px,
+            width: header.width_px,
+            height: header.height_px,
         };
-        to_rgb(frame.sampling, &planes, &mut out.pixels).map_err(|e| e.to_string())
+        to_rgb(header.sampling, &planes, &mut out.pixels).map_err(|e| e.to_string())
     }
 
-    fn scan(&mut self, frame: &Frame, data: &[u8]) -> Result<(), String> {
-        let (across, down) = frame.sampling.blocks();
-        let units_across = (frame.width_px as usize).div_ceil(8 * across);
-        let units_down = (frame.height_px as usize).div_ceil(8 * down);
-        let n_planes = frame.sampling.n_planes();
+    fn scan(&mut self, header: &Header, data: &[u8]) -> Result<(), String> {
+        let (across, down) = header.sampling.blocks();
+        let units_across = (header.width_px as usize).div_ceil(8 * across);
+        let units_down = (header.height_px as usize).div_ceil(8 * down);
+        let n_planes = header.sampling.n_planes();
         let planes = &mut self.planes[..n_planes];
-        for (ix, (plane, component)) in planes.iter_mut().zip(frame.components).enumerate() {
+        for (ix, (plane, component)) in planes.iter_mut().zip(header.components).enumerate() {
             plane.component = component;
             plane.n_blocks = if ix == 0 { (across, down) } else { (1, 1) };
             plane.first = 0;
@@ -98,7 +98,7 @@ impl Baseline {
         for unit in 0..n_units {
             let damaged =
                 |damage| format!("{}, at {unit} of {n_units} units of blocks", said(damage));
-            let interval = frame.restart_interval;
+            let interval = header.restart_interval;
             if interval > 0 && unit > 0 && unit % interval == 0 {
                 bits.restart(unit / interval - 1).map_err(damaged)?;
                 planes.iter_mut().for_each(|plane| plane.first = 0);

@@ -17,7 +17,7 @@ pub(super) enum Sampling {
     Half,
 }
 
-/// What the scan says of one component.
+/// What the header says of one component; `sides`: blocks across and down, four bits each.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Component {
     id: u8,
@@ -28,7 +28,7 @@ pub(super) struct Component {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Frame {
+pub(super) struct Header {
     pub(super) width_px: u32,
     pub(super) height_px: u32,
     pub(super) sampling: Sampling,
@@ -107,7 +107,7 @@ impl Sampling {
     }
 }
 
-impl Frame {
+impl Header {
     /// `None`: it is of another kind, or broken; a decoder of all kinds can tell.
     pub(super) fn read(bytes: &[u8], tables: &mut Tables) -> Option<Self> {
         tables.forget();
@@ -125,7 +125,7 @@ impl Frame {
             let body = bytes.get(at + 4..end)?;
             match marker {
                 // Baseline, and the same with more tables.
-                0xc0 | 0xc1 => found = Some(frame(body)?),
+                0xc0 | 0xc1 => found = Some(size_and_planes(body)?),
                 0xc4 => tables.read_codes(body)?,
                 0xdb => tables.read_quantisers(body)?,
                 0xdd => restart_interval = usize::from(u16::from_be_bytes(*body.first_chunk()?)),
@@ -154,7 +154,7 @@ impl Frame {
     }
 }
 
-fn frame(body: &[u8]) -> Option<(u32, u32, [Component; 3], usize)> {
+fn size_and_planes(body: &[u8]) -> Option<(u32, u32, [Component; 3], usize)> {
     let (&[8, h0, h1, w0, w1, n_planes], rest) = body.split_first_chunk()? else {
         return None;
     };
