@@ -197,7 +197,7 @@ fn read_scan(body: &[u8], components: &mut [Component]) -> Option<()> {
 }
 
 impl Tables {
-    /// A picture uses what it defines itself; without any codes, those that the formats of cameras imply.
+    /// A picture uses what it defines itself. Codes that a camera left out were put back before (`Jpeg`).
     fn forget(&mut self) {
         for quantiser in &mut self.quantisers {
             quantiser.is_set = false;
