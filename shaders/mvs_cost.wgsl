@@ -61,10 +61,10 @@ fn patch_pixel(tile_from: vec2<i32>, ix: u32) -> vec2<i32> {
 }
 
 // Of the sums over a window, the same window of the reference, and the pixel in the middle of both.
-fn score_of(sums: vec3<f32>, window: vec4<f32>, own: vec2<f32>) -> f32 {
+fn score_of(sums: vec3<f32>, window: vec4<f32>, own: vec2<f32>, warp: Warp) -> f32 {
     let spread = max(sums.y - sums.x * sums.x * window.z, 0.0) + sweep.noise_variance / window.z;
     let zncc = (sums.z - window.x * sums.x * window.z) / sqrt(window.y * spread);
-    let off = max(abs(own.y - own.x) - window.w, 0.0);
+    let off = max(abs(warp.gain * own.y + warp.offset - own.x) - window.w, 0.0);
     let like = 1.0 - min(off / sweep.most_off, 1.0);
     return zncc + sweep.own_share * (like - max(zncc, 0.0));
 }
@@ -146,7 +146,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 // -1 where the source does not see the point.
                 let is_seen = pixel_in_source(warp, start, at_$k).z > 0.0;
                 let middle = patches[(row + $ku + SWEEP_WINDOW / 2u) * PATCH_X + column + SWEEP_WINDOW / 2u];
-                let score = select(-1.0, score_of(sums, window_$k, middle), is_seen);
+                let score = select(-1.0, score_of(sums, window_$k, middle, warp), is_seen);
                 second_$k = max(second_$k, min(score, best_$k));
                 best_$k = max(best_$k, score);
             }

@@ -3,6 +3,7 @@
 //! Knows nothing of pictures. Parameters stand in one flat array that every backend shares; the arithmetic here is
 //! f64. Equations: docs/GRADIENTS.md, section 8.
 
+use std::f32::consts::TAU;
 use std::ops::Range;
 
 use glam::{DMat3, DQuat, DVec3};
@@ -30,6 +31,10 @@ pub const BETA_1: f64 = 0.9;
 pub const BETA_2: f64 = 0.999;
 pub const EPS: f64 = 1e-8;
 
+/// Views in the shortest wave of an embedding: shorter ones would follow the noise of single views.
+const FIRST_WAVE: usize = 16;
+/// The longest is 2,048 views long.
+const N_WAVES: usize = 8;
 /// Half the width of the hidden layers' first values: 1/sqrt(64), the usual start of a linear layer.
 const FIRST_BOUND: f32 = 0.125;
 /// Shorter rows of the rotation have no direction: the network has left all sense, and the rotation is none.
@@ -38,6 +43,21 @@ const MIN_ROW: f64 = 1e-6;
 const FIRST_ROWS: [f64; 6] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
 pub type Embedding = [f32; WIDTH];
+
+/// What is known of a view at its start: its place in the order of arrival, as waves from `FIRST_WAVE` views long, each twice
+/// as long as the one before. So the network's motions are smooth along the way, as drift is; with zeros (3R-GS) all views would
+/// have to move alike until they had been told apart.
+pub fn first_embedding(view_ix: usize) -> Embedding {
+    let mut embedding = [0.0; WIDTH];
+    let (waves, _) = embedding.as_chunks_mut::<2>();
+    let mut length = FIRST_WAVE;
+    for wave in &mut waves[..N_WAVES] {
+        let (sin, cos) = (TAU * (view_ix % length) as f32 / length as f32).sin_cos();
+        *wave = [sin, cos];
+        length *= 2;
+    }
+    embedding
+}
 
 /// Adam's state of an array of parameters.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -1,9 +1,14 @@
 //! MCMC moves as the engine makes them: the picture stays, the dead become copies, draws repeat.
 
+use splat_mapper::config::Settings;
+use splat_mapper::eval::trajectory::read_tum;
+use splat_mapper::export::ply;
+use splat_mapper::source::open;
 use splat_mapper::splat::cpu::CpuEngine;
 use splat_mapper::splat::{Engine, McmcSettings, Splats, StepSettings, mcmc};
 
 use crate::backends::ORDINARY;
+use crate::localise::run;
 use crate::reference::random::{self, Recipe, Scene};
 
 const MOVES: McmcSettings = McmcSettings {
@@ -70,6 +75,64 @@ fn moving_and_adding_splats_leaves_the_picture_as_it_is() {
         eprintln!("logits up to {most}, growth {growth}: a pixel differs by {mean:.1e}");
         assert!(mean < bar, "{mean:e}");
     }
+}
+
+/// On a map as it is while it grows, at each of its keyframes: the dead moved and 5 % added, which is one refinement.
+#[test]
+fn one_refinement_of_a_trained_map_leaves_its_pictures_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().to_str().unwrap();
+    let room = "synthetic:room?frames=12&width=160&height=120";
+    let known = [
+        "replay",
+        room,
+        "--out",
+        out,
+        "--geometry",
+        "known",
+        "--backend",
+        "cpu",
+    ];
+    let small = [
+        "--steps",
+        "600",
+        "--set",
+        "select.all=true",
+        "--set",
+        "map.mcmc=true",
+    ];
+    let output = run(&[&known[..], &small[..]].concat());
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    let splats = ply::read(&folder.path().join("map.ply")).unwrap();
+    let params = Settings::shipped().params().unwrap();
+    let mut source = open(room, &params.source, 0).unwrap();
+    let lens = source.next().unwrap().intrinsics.unwrap();
+    let poses = read_tum(&folder.path().join("keyframes.tum")).unwrap();
+    let mut engine = CpuEngine::new();
+    engine.append(&splats);
+    let pictures = |engine: &mut CpuEngine| -> Vec<f32> {
+        let of = poses.iter();
+        of.flat_map(|p| engine.render(&lens, &p.pose.inverse(), 3).rgb)
+            .collect()
+    };
+    let before = pictures(&mut engine);
+    let n = engine.relocate_and_grow(&McmcSettings {
+        growth: 1.05,
+        ..MOVES
+    });
+    let after = pictures(&mut engine);
+    let off: f64 = before
+        .iter()
+        .zip(&after)
+        .map(|(a, b)| f64::from((a - b).abs()))
+        .sum();
+    let mean = off / before.len() as f64;
+    eprintln!(
+        "{} splats become {n}: a pixel differs by {mean:.1e}",
+        splats.len()
+    );
+    assert!(n > splats.len() && mean < 1e-3, "{n} {mean:e}");
 }
 
 #[test]

@@ -11,8 +11,9 @@ use rayon::prelude::*;
 
 use super::Prepared;
 use super::grey::Grey;
+use super::light::Light;
 use super::sweep::Warp;
-use super::zncc::{MOST_OFF, NOISE_VARIANCE, WINDOW, integer};
+use super::zncc::{NOISE_VARIANCE, WINDOW, integer};
 
 /// Relative difference of depth that is a jump.
 pub(super) const JUMP: f32 = 0.04;
@@ -21,15 +22,17 @@ const REACH: usize = WINDOW / 2;
 const RADIUS: usize = 2;
 /// From one pixel of the window to the next, in pixels of the depth map. Closer together they tell narrower things
 /// apart, and lose more where poses are off by a part of a pixel.
-const STEP_PX: f64 = 0.8;
+const STEP_PX: f64 = 0.6;
 const SIDE: usize = 2 * RADIUS + 1;
 /// A luma difference at which a neighbour counts 1/e.
 const LIKE_LUMA: f32 = 10.0 / 255.0;
 /// Every neighbour counts this much: a lone pixel has nothing to correlate.
 const LEAST_LIKE: f32 = 0.02;
 /// Of a score, what the differences of luma say; the rest is ZNCC, to which a bright rim alone can look right. A larger
-/// share costs depth where pictures differ in brightness.
-const LUMA_SHARE: f32 = 0.5;
+/// share costs depth where the light differs from place to place.
+const LUMA_SHARE: f32 = 0.6;
+/// A mean difference of luma from which on the window says no.
+const MOST_OFF: f32 = 0.05;
 /// A depth that matches worse is none.
 const MIN_SCORE: f32 = 0.25;
 
@@ -168,16 +171,16 @@ impl Support {
             down.as_vec2() / RADIUS as f32,
         );
         let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
-        Some(self.score_of(&sampled(warp.fine, corner, right, down)))
+        Some(self.score_of(&sampled(warp.fine, corner, right, down), warp.light))
     }
 
-    fn score_of(&self, seen: &[f32; LANES]) -> f32 {
+    fn score_of(&self, seen: &[f32; LANES], light: Light) -> f32 {
         let mean: f32 = self.weights.iter().zip(seen).map(|(w, v)| w * v).sum();
         let (mut variance, mut covariance, mut off) = (NOISE_VARIANCE, 0.0, 0.0);
         for ((weight, own), other) in self.weights.iter().zip(&self.values).zip(seen) {
             variance += weight * (other - mean).powi(2);
             covariance += weight * (own - self.mean) * (other - mean);
-            off += weight * (own - other).abs();
+            off += weight * (light.of_source(*own) - other).abs();
         }
         let zncc = covariance / (self.variance * variance).sqrt();
         let like = 1.0 - (off / MOST_OFF).min(1.0);

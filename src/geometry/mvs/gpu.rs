@@ -196,7 +196,9 @@ impl Room {
                 width_px: warp.source.width as u32,
                 height_px: warp.source.height as u32,
                 first: first as u32,
-                padding_0: 0,
+                gain: warp.light.gain,
+                offset: warp.light.offset,
+                ..types::Warp::default()
             };
             gpu.write(&self.warps, ix, &[there]);
             gpu.write(&self.luma, first, &warp.source.values);

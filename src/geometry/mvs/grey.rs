@@ -34,6 +34,15 @@ impl Grey {
         finer
     }
 
+    pub(super) fn empty() -> Self {
+        Self {
+            width: 0,
+            height: 0,
+            values: Vec::new(),
+            colours: Vec::new(),
+        }
+    }
+
     /// A picture whose pixels do not fit its size counts as empty.
     fn resized(image: &RgbImage, (width, height): (usize, usize)) -> Self {
         let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
@@ -42,12 +51,7 @@ impl Grey {
             .and_then(|n| n.checked_mul(3))
             == Some(image.pixels.len());
         if !fits || image.pixels.is_empty() {
-            return Self {
-                width: 0,
-                height: 0,
-                values: Vec::new(),
-                colours: Vec::new(),
-            };
+            return Self::empty();
         }
         let columns = shares(from_width, width);
         let rows = shares(from_height, height);

@@ -7,6 +7,7 @@ mod consistency;
 mod edges;
 pub mod gpu;
 mod grey;
+mod light;
 mod matcher;
 pub mod neighbours;
 mod planes;
@@ -156,21 +157,32 @@ impl<'a> Task<'a> {
             inverse_far: 1.0 / far,
             n: params.n_depths.max(3),
         };
-        let warps: Vec<sweep::Warp<'_>> = sources
+        let (sources, mut warps): (Vec<&Prepared>, Vec<sweep::Warp<'_>>) = sources
             .iter()
             .filter(|source| source.is_usable())
-            .filter_map(|source| sweep::Warp::new(reference, source, &planes))
+            .filter_map(|source| Some((*source, sweep::Warp::new(reference, source, &planes)?)))
             .take(params.n_sources)
-            .collect();
-        (!warps.is_empty()).then_some(Self {
-            reference,
-            warps,
-            planes,
+            .unzip();
+        (!warps.is_empty()).then(|| {
+            let lights = light::Light::of(reference, &sources, &planes);
+            for (warp, light) in warps.iter_mut().zip(lights) {
+                warp.light = light;
+            }
+            Self {
+                reference,
+                warps,
+                planes,
+            }
         })
     }
 
     fn winners_on_cpu(&self) -> sgm::Winners {
-        let costs = sweep::matching_costs(&self.reference.grey, &self.warps, &self.planes);
+        let costs = sweep::matching_costs(
+            &self.reference.grey,
+            &self.warps,
+            &self.planes,
+            zncc::OWN_SHARE,
+        );
         sgm::best_planes(&self.reference.grey, &costs, self.planes.n)
     }
 

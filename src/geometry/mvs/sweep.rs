@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use super::Prepared;
 use super::grey::Grey;
+use super::light::Light;
 use super::planes::Planes;
 use super::zncc::{Statistics, WarpedRow, plane_costs};
 
@@ -26,6 +27,7 @@ pub(super) struct Warp<'a> {
     /// Columns for x, y and 1. Pixel index space on both sides: centres at integers.
     pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
+    pub(super) light: Light,
 }
 
 impl<'a> Warp<'a> {
@@ -52,6 +54,7 @@ impl<'a> Warp<'a> {
                 project(rotation * corner),
             ],
             shift: project(source_from_reference.translation),
+            light: Light::SAME,
         };
         let middle = 0.5 * (planes.inverse_near + planes.inverse_far);
         let angle = source_from_reference.translation.length() * middle;
@@ -108,8 +111,13 @@ impl<'a> Warp<'a> {
     }
 }
 
-/// Cost 0 (perfect) to 255, `[y][x][plane]`.
-pub(super) fn matching_costs(reference: &Grey, warps: &[Warp<'_>], planes: &Planes) -> Vec<u8> {
+/// Cost 0 (perfect) to 255, `[y][x][plane]`. `own_share`: of a score, what the pixel itself says; the rest is ZNCC.
+pub(super) fn matching_costs(
+    reference: &Grey,
+    warps: &[Warp<'_>],
+    planes: &Planes,
+    own_share: f32,
+) -> Vec<u8> {
     let n_pixels = reference.width * reference.height;
     let statistics = Statistics::of(reference);
     let mut by_plane = vec![0_u8; planes.n * n_pixels];
@@ -121,6 +129,7 @@ pub(super) fn matching_costs(reference: &Grey, warps: &[Warp<'_>], planes: &Plan
                 reference,
                 &statistics,
                 warps,
+                own_share,
                 planes.inverse_depth(plane as f64),
                 costs,
             );

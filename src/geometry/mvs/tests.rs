@@ -10,7 +10,7 @@ use super::matcher::{Matcher, timed};
 use super::sgm::Winners;
 use super::state::MvsState;
 use super::sweep as sweep_on_cpu;
-use super::{MvsView, Prepared, RawDepth, Task, prepared, sgm, sweep};
+use super::{MvsView, Prepared, RawDepth, Task, prepared, sgm, sweep, zncc};
 use crate::camera::Intrinsics;
 use crate::config::{Backend, MvsParams, Settings};
 use crate::frame::RgbImage;
@@ -137,6 +137,19 @@ fn with_task<T>(
     run(&Task::new(&reference, &sources, range, params).unwrap())
 }
 
+/// The same picture in another light.
+fn relit(view: &MvsView, gain: f32, offset: f32) -> MvsView {
+    let pixels = view.image.pixels.iter();
+    let lit = pixels.map(|p| (gain * f32::from(*p) + offset).clamp(0.0, 255.0) as u8);
+    MvsView {
+        image: Arc::new(RgbImage {
+            pixels: lit.collect(),
+            ..*view.image
+        }),
+        ..view.clone()
+    }
+}
+
 fn share(n: usize, of: usize) -> f64 {
     n as f64 / of as f64
 }
@@ -152,9 +165,18 @@ fn share_of_equal_winners(a: &Winners, b: &Winners) -> f64 {
 
 /// Both machines on one scene: costs, then winners.
 fn check(size: (u32, u32), n_sources: usize, n_depths: usize, range: (f64, f64)) {
-    let params = params(n_depths, n_sources.max(1));
-    with_task(&scene(size, n_sources), range, &params, |task| {
-        let on_cpu = sweep::matching_costs(&task.reference.grey, &task.warps, &task.planes);
+    check_scene(&scene(size, n_sources), n_depths, range);
+}
+
+fn check_scene(scene: &(MvsView, Vec<MvsView>), n_depths: usize, range: (f64, f64)) {
+    let params = params(n_depths, scene.1.len().max(1));
+    with_task(scene, range, &params, |task| {
+        let on_cpu = sweep::matching_costs(
+            &task.reference.grey,
+            &task.warps,
+            &task.planes,
+            zncc::OWN_SHARE,
+        );
         let (winners, on_gpu) = with_gpu(|gpu| (gpu.winners(task).unwrap(), gpu.costs(task)));
         assert_eq!(on_gpu.len(), on_cpu.len());
         let n_off = on_cpu
@@ -162,7 +184,8 @@ fn check(size: (u32, u32), n_sources: usize, n_depths: usize, range: (f64, f64))
             .zip(&on_gpu)
             .filter(|(a, b)| a.abs_diff(**b) > MAX_COST_ERROR)
             .count();
-        let shown = format!("{size:?}, {n_sources} sources, {n_depths} planes");
+        let (image, n_sources) = (&scene.0.image, scene.1.len());
+        let shown = format!("{image:?}, {n_sources} sources, {n_depths} planes");
         assert!(
             share(n_off, on_cpu.len()) <= 1e-3,
             "{shown}: {n_off} of {} costs differ",
@@ -202,6 +225,51 @@ fn planes_outside_of_the_scene_or_the_sources_match_too() {
     for range in [(0.2, 0.9), (7.0, 60.0), (0.03, 50.0)] {
         check((64, 48), 4, 32, range);
     }
+}
+
+#[test]
+fn a_source_in_another_light_is_matched_as_if_it_were_in_the_same() {
+    let size = (320, 240);
+    let (reference, sources) = scene(size, 3);
+    // Of little contrast, so that there are even places.
+    let pale = |view: &MvsView| relit(view, 0.4, 77.0);
+    let (reference, sources): (MvsView, Vec<MvsView>) =
+        (pale(&reference), sources.iter().map(pale).collect());
+    let params = params(64, 3);
+    let lights = [(1.0, 0.0), (0.8, 30.0), (1.1, -20.0)];
+    let relit: Vec<MvsView> = sources
+        .iter()
+        .zip(lights)
+        .map(|(view, (gain, offset))| relit(view, gain, offset))
+        .collect();
+    with_task(
+        &(reference.clone(), relit.clone()),
+        RANGE,
+        &params,
+        |task| {
+            for (warp, (gain, offset)) in task.warps.iter().zip(lights) {
+                // Luma is centred: half of what the gain takes off is offset.
+                let offset = offset / 255.0 + 0.5 * (gain - 1.0);
+                let off = (warp.light.gain - gain)
+                    .abs()
+                    .max((warp.light.offset - offset).abs());
+                // Neighbours taken for each other draw the line a little towards the mean.
+                assert!(off < 0.1, "{gain} {offset}: {:?}", warp.light);
+            }
+        },
+    );
+    let good = |sources: &[MvsView]| {
+        let sources: Vec<&MvsView> = sources.iter().collect();
+        let raw = sweep_on_cpu(&reference, &sources, RANGE, &params);
+        let errors = relative_errors(&raw, size);
+        share(
+            errors.iter().filter(|e| **e < 0.02).count(),
+            raw.depth.len(),
+        )
+    };
+    let (same, other) = (good(&sources), good(&relit));
+    assert!(same > 0.9 && other > same - 0.02, "{same} {other}");
+    check_scene(&(reference, relit), 48, RANGE);
 }
 
 fn relative_errors(raw: &RawDepth, (width_px, height_px): (u32, u32)) -> Vec<f64> {

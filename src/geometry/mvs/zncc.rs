@@ -3,6 +3,7 @@
 use multiversion::multiversion;
 
 use super::grey::Grey;
+use super::light::Light;
 use super::sweep::Warp;
 
 /// Side of the matching window in pixels. A wider one makes things wider; smoothness takes care of the noise.
@@ -28,7 +29,7 @@ pub(super) const UNSEEN_ZNCC: f32 = 0.2;
 pub(super) const OWN_SHARE: f32 = 0.3;
 
 /// A difference of luma from which on the pixel itself says no.
-pub(super) const MOST_OFF: f32 = 0.05;
+pub(super) const MOST_OFF: f32 = 0.03;
 
 /// Homogeneous source pixels along one row of the reference.
 pub(super) struct WarpedRow {
@@ -84,7 +85,7 @@ impl Statistics {
     }
 }
 
-fn slack(grey: &Grey, x: usize, y: usize) -> f32 {
+pub(super) fn slack(grey: &Grey, x: usize, y: usize) -> f32 {
     let (row, own) = (grey.row(y), grey.row(y)[x]);
     let beside = [
         row[x.saturating_sub(1)],
@@ -108,6 +109,7 @@ pub(super) fn plane_costs(
     reference: &Grey,
     statistics: &Statistics,
     warps: &[Warp<'_>],
+    own_share: f32,
     inverse_depth: f64,
     costs: &mut [u8],
 ) {
@@ -139,7 +141,7 @@ pub(super) fn plane_costs(
         let at = centre * stride..(centre + 1) * stride;
         scratch.best.fill(-1.0);
         scratch.second.fill(-1.0);
-        for ring in &rings {
+        for (ring, warp) in rings.iter().zip(warps) {
             column_sums(reference, ring, window_rows.clone(), &mut scratch);
             let of_reference = [
                 &statistics.sum[at.clone()],
@@ -149,8 +151,19 @@ pub(super) fn plane_costs(
             let slot = (centre % WINDOW) * stride;
             let own = &ring.values[slot..slot + width];
             let slack = &statistics.slack[at.start..at.start + width];
-            likeness(reference.row(centre), own, slack, &mut scratch.likeness);
-            window_scores(of_reference, &ring.seen[slot..slot + stride], &mut scratch);
+            likeness(
+                reference.row(centre),
+                own,
+                slack,
+                warp.light,
+                &mut scratch.likeness,
+            );
+            window_scores(
+                of_reference,
+                &ring.seen[slot..slot + stride],
+                own_share,
+                &mut scratch,
+            );
         }
         let into = &mut costs[centre * width..(centre + 1) * width];
         mean_costs(&scratch.best, &scratch.second, into);
@@ -259,17 +272,17 @@ fn column_sums(reference: &Grey, ring: &Ring, rows: std::ops::Range<usize>, scra
 
 /// What the pixels themselves say: 1 alike, 0 not.
 #[multiversion(targets("x86_64+avx2"))]
-fn likeness(reference: &[f32], source: &[f32], slack: &[f32], into: &mut [f32]) {
+fn likeness(reference: &[f32], source: &[f32], slack: &[f32], light: Light, into: &mut [f32]) {
     let pairs = reference.iter().zip(source).zip(slack);
     for (((own, other), slack), like) in pairs.zip(into) {
-        let off = ((own - other).abs() - slack).max(0.0);
+        let off = ((light.of_source(*own) - other).abs() - slack).max(0.0);
         *like = 1.0 - (off / MOST_OFF).min(1.0);
     }
 }
 
 /// Keeps the best two sources of every pixel of a row.
 #[multiversion(targets("x86_64+avx2"))]
-fn window_scores(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch) {
+fn window_scores(of_reference: [&[f32]; 3], seen: &[f32], own_share: f32, scratch: &mut Scratch) {
     let [reference_sum, reference_spread, one_over_n] =
         of_reference.map(|row| row.as_chunks::<BLOCK>().0);
     let seen = seen.as_chunks::<BLOCK>().0;
@@ -291,7 +304,7 @@ fn window_scores(of_reference: [&[f32]; 3], seen: &[f32], scratch: &mut Scratch)
             let spread = (ss[x] - s[x] * s[x] * share).max(0.0) + NOISE_VARIANCE / share;
             let zncc =
                 (rs[x] - reference_sum[x] * s[x] * share) / (reference_spread[x] * spread).sqrt();
-            let score = zncc + OWN_SHARE * (likeness[x] - zncc.max(0.0));
+            let score = zncc + own_share * (likeness[x] - zncc.max(0.0));
             let score = if seen[x] > 0.0 { score } else { -1.0 };
             second[x] = second[x].max(score.min(best[x]));
             best[x] = best[x].max(score);

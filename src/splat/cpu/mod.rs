@@ -221,7 +221,8 @@ impl Engine for CpuEngine {
     }
 
     fn add_view(&mut self, view: TrainingView) -> usize {
-        self.views.push(View::new(view, self.refiner.as_ref()));
+        let new = View::new(view, self.views.len(), self.refiner.as_ref());
+        self.views.push(new);
         self.views.len() - 1
     }
 
@@ -258,8 +259,8 @@ impl Engine for CpuEngine {
 
     fn start_refiner(&mut self, settings: &RefinerSettings) {
         let old = self.refiner.take();
-        for view in &mut self.views {
-            view.fold(old.as_ref());
+        for (ix, view) in self.views.iter_mut().enumerate() {
+            view.fold(ix, old.as_ref());
         }
         self.refiner = Some(Refiner::new(settings));
     }

@@ -8,7 +8,7 @@ use crate::frame::RgbImage;
 use crate::pose::Rigid;
 use crate::splat::cpu::exposure::{Exposure, ExposureAdam};
 use crate::splat::cpu::pose_adam::PoseAdam;
-use crate::splat::refiner::{Embedding, Moments, Refiner, WIDTH};
+use crate::splat::refiner::{Embedding, Moments, Refiner, first_embedding};
 use crate::splat::{Match, StepSettings, TrainingView};
 
 #[derive(Debug)]
@@ -24,11 +24,11 @@ pub(super) struct View {
 }
 
 impl View {
-    /// The camera stands where `view` says, whatever the network does to it.
-    pub(super) fn new(view: TrainingView, refiner: Option<&Refiner>) -> Self {
+    /// The camera stands where `view` says, whatever the network does to it. `ix`: its place in the order of arrival.
+    pub(super) fn new(view: TrainingView, ix: usize, refiner: Option<&Refiner>) -> Self {
         let mut new = Self {
             training: view,
-            embedding: [0.0; WIDTH],
+            embedding: first_embedding(ix),
             moments: Moments::default(),
             adam: PoseAdam::default(),
             matches: Vec::new(),
@@ -62,9 +62,9 @@ impl View {
     }
 
     /// What the old network did stays in the base; the new one starts from nothing.
-    pub(super) fn fold(&mut self, old: Option<&Refiner>) {
+    pub(super) fn fold(&mut self, ix: usize, old: Option<&Refiner>) {
         self.training.cam_from_map = self.pose(old);
-        self.embedding = [0.0; WIDTH];
+        self.embedding = first_embedding(ix);
         self.moments = Moments::default();
     }
 

@@ -15,7 +15,7 @@ use crate::gpu::types::{
     VIEW_PINHOLE, VIEW_POSE_AGE, VIEW_POSE_M, VIEW_QUAT, VIEW_STRIDE, VIEW_TRANSLATION,
 };
 use crate::pose::Rigid;
-use crate::splat::refiner::{Embedding, Refiner, WIDTH};
+use crate::splat::refiner::{Embedding, Refiner, WIDTH, first_embedding};
 use crate::splat::{Match, RefinerSettings, TrainingView};
 
 const MIN_VIEWS: usize = 64;
@@ -69,6 +69,8 @@ impl Views {
         let view = View::new(gpu, training)?;
         let ix = self.all.len();
         let pose = view.training.cam_from_map;
+        let embedding = ix * VIEW_STRIDE + VIEW_EMBEDDING;
+        gpu.write(&self.records, embedding, &first_embedding(ix));
         self.write_camera(gpu, ix, &view.training.intrinsics);
         self.all.push(view);
         self.set_pose(gpu, ix, pose)?;
@@ -161,11 +163,9 @@ impl Views {
         for (ix, pose) in poses.iter().enumerate() {
             self.write_base(gpu, ix, pose);
             let record = ix * VIEW_STRIDE;
-            gpu.write(
-                &self.records,
-                record + VIEW_EMBEDDING,
-                &[0.0_f32; 3 * WIDTH],
-            );
+            let mut row = [0.0_f32; 3 * WIDTH];
+            row[..WIDTH].copy_from_slice(&first_embedding(ix));
+            gpu.write(&self.records, record + VIEW_EMBEDDING, &row);
             gpu.write(&self.records, record + VIEW_EMBEDDING_AGE, &[0.0_f32]);
         }
         self.refiner = Some(*settings);
