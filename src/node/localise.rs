@@ -15,7 +15,7 @@ use crate::map::snapshot::Scale;
 use crate::map::{SplatMap, checkpoint};
 use crate::node::run_dir::tracking_figures;
 use crate::node::track_stage::TrackStage;
-use crate::node::{Stop, engine};
+use crate::node::{Grace, Stop, engine};
 use crate::source::Source;
 use crate::track::Tracker;
 
@@ -61,6 +61,7 @@ pub fn localise(
         None
     };
     let mut stage = TrackStage::of(Some(tracker), false);
+    stage.grace = Grace::new(stop.clone());
     while let Some(frame) = source.next().filter(|_| !stop.is_asked()) {
         stage.track(&frame, &Stopwatch::start());
         if let Some(splats) = &mut splats {

@@ -100,6 +100,27 @@ impl Stop {
     }
 }
 
+/// Seconds since a stop was asked for, as far as who waits for it has looked.
+#[derive(Debug, Default)]
+struct Grace {
+    stop: Stop,
+    since: Option<Stopwatch>,
+}
+
+impl Grace {
+    fn new(stop: Stop) -> Self {
+        Self { stop, since: None }
+    }
+
+    /// Whether a stop was asked for more than so many seconds ago. The first look after a stop counts as its moment.
+    fn is_over(&mut self, secs: f64) -> bool {
+        if self.since.is_none() && self.stop.is_asked() {
+            self.since = Some(Stopwatch::start());
+        }
+        self.since.is_some_and(|watch| watch.secs() > secs)
+    }
+}
+
 /// How far a run is: for progress bars and logs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {

@@ -10,7 +10,7 @@ use crate::map::{SplatMap, checkpoint};
 use crate::node::autosave::Autosave;
 use crate::node::stages::MapStage;
 use crate::node::track_stage::TrackStage;
-use crate::node::{Job, engine};
+use crate::node::{Grace, Job, engine};
 use crate::publish::service::Call;
 use crate::queue::{WhenFull, queue};
 
@@ -28,6 +28,7 @@ pub(super) fn open(job: &Job, scale: Scale, calls: Option<Calls<Call>>) -> anyho
         .measuring_scale(&params.scale)
         .spilling_to(job.out.as_deref());
     let mut track = TrackStage::new(&params.track, job.is_live);
+    track.grace = Grace::new(job.stop.clone());
     if !params.map.load.is_empty() {
         let saved = checkpoint::read(Path::new(&params.map.load))?;
         track.begin_in(&saved.landmarks, &params.track)?;

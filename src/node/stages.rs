@@ -13,7 +13,7 @@ use crate::map::snapshot::Snapshot;
 use crate::node::autosave::Autosave;
 use crate::node::fitting::Fitter;
 use crate::node::outward::Clerk;
-use crate::node::{Progress, Stop};
+use crate::node::{Grace, Progress, Stop};
 use crate::pose::Rigid;
 use crate::publish::outbox::Outbox;
 use crate::select::{Batcher, Selector};
@@ -54,8 +54,7 @@ pub(super) struct MapStage {
     unpublished: BTreeMap<u32, Stopwatch>,
     pub(super) autosave: Option<Autosave>,
     since_snapshot: Stopwatch,
-    /// Since a stop was noticed.
-    since_stop: Option<Stopwatch>,
+    grace: Grace,
     n_keyframes: usize,
     pub(super) optimise_secs: f64,
     pub(super) keyframe_to_pose_secs: Vec<f64>,
@@ -110,6 +109,7 @@ impl MapStage {
             params: params.map.clone(),
             is_live,
             clerk: Clerk::new(calls, &params.track, stop.clone()),
+            grace: Grace::new(stop.clone()),
             stop,
             n_frames,
             fitter: None,
@@ -117,7 +117,6 @@ impl MapStage {
             unpublished: BTreeMap::new(),
             autosave: None,
             since_snapshot: Stopwatch::start(),
-            since_stop: None,
             n_keyframes: 0,
             optimise_secs: 0.0,
             keyframe_to_pose_secs: Vec::new(),
@@ -215,11 +214,7 @@ impl MapStage {
 
     /// After a stop, geometry gets a moment for the batch that it is at, and no more: a network can take minutes.
     pub(super) fn gives_up(&mut self) -> bool {
-        if self.since_stop.is_none() && self.stop.is_asked() {
-            self.since_stop = Some(Stopwatch::start());
-        }
-        self.since_stop
-            .is_some_and(|watch| watch.secs() > SECS_AFTER_STOP)
+        self.grace.is_over(SECS_AFTER_STOP)
     }
 
     /// Writes the map's part of the status.

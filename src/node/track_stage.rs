@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use crate::clock::Stopwatch;
 use crate::config::track::TrackParams;
 use crate::frame::Frame;
+use crate::node::Grace;
 use crate::node::fitting::Asker;
 use crate::node::outward::LiveEvent;
 use crate::pose::Rigid;
@@ -18,6 +19,9 @@ use crate::track::{FramePlace, KeyframeView, State, TrackedFrame, Tracker, Track
 const MAX_TIMES: usize = 100_000;
 /// Live, where the queue is never empty: frames after which news of the map are taken in all the same.
 const MAX_FRAMES_WITHOUT_NEWS: usize = 10;
+
+/// Seconds that frames which still wait get after a stop.
+const SECS_AFTER_STOP: f64 = 0.3;
 
 /// Seconds between landmarks for map files that somebody may ask for.
 const TELL_SECS: f64 = 20.0;
@@ -55,6 +59,9 @@ pub(super) struct TrackStage {
     is_heard: bool,
     /// Who finds where pictures fit the splats.
     pub(super) asker: Option<Asker>,
+    pub(super) grace: Grace,
+    /// Frames that had come before a stop and were left.
+    n_left: u64,
 }
 
 /// What tracking leaves behind.
@@ -63,7 +70,7 @@ pub struct Tracking {
     pub tracks: Tracks,
     /// What a later run needs to find its place in the map; empty without tracking.
     pub landmarks: Vec<u8>,
-    /// Live: frames that made room for newer ones before they were tracked.
+    /// Live: frames that made room for newer ones before they were tracked, or that a stop left no time for.
     pub n_dropped: u64,
     /// Seconds of work, in all and per frame.
     pub secs: f64,
@@ -92,6 +99,8 @@ impl TrackStage {
             events: Vec::new(),
             is_heard: false,
             asker: None,
+            grace: Grace::default(),
+            n_left: 0,
         }
     }
 
@@ -142,6 +151,10 @@ impl TrackStage {
         let Some(tracker) = &mut self.tracker else {
             return;
         };
+        if self.grace.is_over(SECS_AFTER_STOP) {
+            self.n_left += 1;
+            return;
+        }
         let watch = Stopwatch::start();
         let fitted = self.asker.as_ref().and_then(Asker::answer);
         if let Some((placement, key_from_cam)) = fitted {
@@ -236,14 +249,16 @@ impl TrackStage {
         let watch = Stopwatch::start();
         let saved = self.tracker.as_ref().map(Tracker::saved);
         let landmarks = saved.unwrap_or_else(|| Ok(Vec::new()));
-        let tracks = self.tracker.take().map(Tracker::finish);
+        let mut grace = self.grace;
+        let goes_on = || !grace.is_over(SECS_AFTER_STOP);
+        let tracks = self.tracker.take().map(|tracker| tracker.finish(goes_on));
         Tracking {
             landmarks: landmarks.unwrap_or_else(|reason| {
                 tracing::warn!("later runs will not find their place in this map: {reason}");
                 Vec::new()
             }),
             tracks: tracks.unwrap_or_default(),
-            n_dropped,
+            n_dropped: n_dropped + self.n_left,
             secs: self.secs + watch.secs(),
             frame_secs: self.frame_secs.into(),
             latency_secs: self.latency_secs.into(),

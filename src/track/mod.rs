@@ -210,12 +210,8 @@ impl Tracker {
     /// Gives frames that the map has reached since a pose by the keyframes on both sides of them, at most `n` frames.
     /// Returns how many were looked at.
     pub fn look_again(&mut self, n: usize) -> usize {
-        let newest = self
-            .landmarks
-            .held
-            .values()
-            .map(|held| held.seen.stamp)
-            .max();
+        let held = self.landmarks.held.values();
+        let newest = held.map(|held| held.seen.stamp).max();
         let mut done = 0;
         while done < n {
             let is_reached = |w: &Waiting| newest.is_some_and(|newest| w.seen.stamp <= newest);
@@ -231,9 +227,12 @@ impl Tracker {
         done
     }
 
-    /// The last word: looks at what still waits, and says where every frame was by the last poses of the keyframes.
-    pub fn finish(mut self) -> Tracks {
-        while let Some(waiting) = self.waiting.pop_front() {
+    /// The last word: looks at what still waits, as long as that `goes_on`, and says where every frame was by the last
+    /// poses of the keyframes.
+    pub fn finish(mut self, mut goes_on: impl FnMut() -> bool) -> Tracks {
+        while goes_on()
+            && let Some(waiting) = self.waiting.pop_front()
+        {
             self.second_look(&waiting);
         }
         let tracks: Vec<FrameTrack> = self.history.frames.iter().map(|f| self.told(f)).collect();

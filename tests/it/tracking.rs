@@ -130,7 +130,7 @@ fn frames_from_before_the_map_get_their_pose_on_a_second_look() {
     }
     tracker.update(&views(frames));
     assert_eq!(tracker.look_again(5), 5);
-    let tracks = tracker.finish();
+    let tracks = tracker.finish(|| true);
     assert_eq!((tracks.n_frames, tracks.n_tracked), (17, 0));
     for (track, frame) in tracks.frames.iter().zip(frames) {
         let (pose, truth) = (track.refined.unwrap(), frame.truth.unwrap());
@@ -170,7 +170,7 @@ fn a_blackout_is_declared_and_over_as_soon_as_there_is_light() {
     );
     let next = tracker.track(&at(&frames[35], 51, 5.1));
     assert_eq!(next.state, State::Tracking);
-    let tracks = tracker.finish();
+    let tracks = tracker.finish(|| true);
     assert_eq!((tracks.n_lost, tracks.n_relocalised), (1, 1));
 }
 
@@ -245,7 +245,7 @@ fn the_pose_follows_keyframes_that_the_map_moves_and_rescales() {
         (found.translation - wanted.translation).length() < 0.03 && found.angle_to(&wanted) < 0.01
     );
     // Frames that nothing looks at again move with their keyframe, too.
-    let tracks = tracker.finish();
+    let tracks = tracker.finish(|| true);
     for (track, frame) in tracks.frames.iter().zip(frames) {
         let (found, wanted) = (track.refined.unwrap(), moved(frame.truth.unwrap()));
         assert!((found.translation - wanted.translation).length() < 0.03);
