@@ -165,6 +165,8 @@ def silence(observer, recording):
     publisher = observer.node.create_publisher(CompressedImage, "/late/image_raw/compressed", SENSOR)
     found = late.wait_for_log("/late/image_raw/compressed is subscribed as sensor_msgs/msg/CompressedImage", 5.0)
     check("a publisher that comes late is found, and what it sends", found)
+    # A picture that is sent before both sides know of each other is lost.
+    wait_until(lambda: publisher.get_subscription_count() > 0, 5.0)
     publisher.publish(recording["/camera/image_raw/compressed"][0])
     check("a camera without CameraInfo is waited for, then taken as uncalibrated", late.wait_for_log("counts as uncalibrated", 6.0))
     late.end()
