@@ -5,7 +5,7 @@
 #import sweep
 
 @group(0) @binding(0) var<uniform> sweep: Sweep;
-// The reference, then each source; -0.5 to 0.5.
+// The reference; then each source and the reference in its light; -0.5 to 0.5.
 @group(0) @binding(1) var<storage, read> luma: array<f32>;
 // Of the window around each reference pixel: sum, n * variance + noise, 1/n; and how far off its
 // luma may be.
@@ -60,11 +60,12 @@ fn patch_pixel(tile_from: vec2<i32>, ix: u32) -> vec2<i32> {
     return tile_from + vec2<i32>(i32(ix % PATCH_X), i32(ix / PATCH_X)) - i32(SWEEP_WINDOW / 2u);
 }
 
-// Of the sums over a window, the same window of the reference, and the pixel in the middle of both.
-fn score_of(sums: vec3<f32>, window: vec4<f32>, own: vec2<f32>, warp: Warp) -> f32 {
+// Of the sums over a window, the same window of the reference, and the pixel in the middle: in the source, and in the
+// reference as the source shows it.
+fn score_of(sums: vec3<f32>, window: vec4<f32>, own: f32, shown: f32) -> f32 {
     let spread = max(sums.y - sums.x * sums.x * window.z, 0.0) + sweep.noise_variance / window.z;
     let zncc = (sums.z - window.x * sums.x * window.z) / sqrt(window.y * spread);
-    let off = max(abs(warp.gain * own.y + warp.offset - own.x) - window.w, 0.0);
+    let off = max(abs(shown - own) - window.w, 0.0);
     let like = 1.0 - min(off / sweep.most_off, 1.0);
     return zncc + sweep.own_share * (like - max(zncc, 0.0));
 }
@@ -145,8 +146,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #end
                 // -1 where the source does not see the point.
                 let is_seen = pixel_in_source(warp, start, at_$k).z > 0.0;
-                let middle = patches[(row + $ku + SWEEP_WINDOW / 2u) * PATCH_X + column + SWEEP_WINDOW / 2u];
-                let score = select(-1.0, score_of(sums, window_$k, middle, warp), is_seen);
+                let middle = patches[(row + $ku + SWEEP_WINDOW / 2u) * PATCH_X + column + SWEEP_WINDOW / 2u].x;
+                let shown = luma[warp.shown + u32(at_$k.y) * sweep.width_px + u32(at_$k.x)];
+                let score = select(-1.0, score_of(sums, window_$k, middle, shown), is_seen);
                 second_$k = max(second_$k, min(score, best_$k));
                 best_$k = max(best_$k, score);
             }

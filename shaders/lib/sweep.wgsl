@@ -29,12 +29,8 @@ struct Warp {
     height_px: u32,
     // Of its pixels in `luma`.
     first: u32,
-    // Luma of the source = gain * luma of the reference + offset.
-    gain: f32,
-    offset: f32,
-    padding_0: u32,
-    padding_1: u32,
-    padding_2: u32,
+    // Of the reference's pixels in `luma`, in the light of this source.
+    shown: u32,
 }
 
 // The lowest sum of a pixel, with its neighbours and the lowest sum beyond them: two halves of 16 bits a word.

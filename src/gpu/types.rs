@@ -155,11 +155,7 @@ pub struct Warp {
     pub width_px: u32,
     pub height_px: u32,
     pub first: u32,
-    pub gain: f32,
-    pub offset: f32,
-    pub padding_0: u32,
-    pub padding_1: u32,
-    pub padding_2: u32,
+    pub shown: u32,
 }
 
 /// `Dip` of `shaders/lib/sweep.wgsl`.

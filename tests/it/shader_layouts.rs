@@ -201,10 +201,7 @@ fn structs_of_a_sweep_have_the_layout_of_the_host() {
         padding_1
     );
     assert_eq!(layout_in("Sweep", &kernel("mvs_cost")), sweep);
-    let warp: Layout = host_layout!(
-        Warp, step_x, step_y, width_px, height_px, first, gain, offset, padding_0, padding_1,
-        padding_2
-    );
+    let warp: Layout = host_layout!(Warp, step_x, step_y, width_px, height_px, first, shown);
     assert_eq!(layout_in("Warp", &kernel("mvs_cost")), warp);
     let dip: Layout = host_layout!(Dip, plane, cost, before_at, after_second);
     assert_eq!(layout_in("Dip", &kernel("mvs_winner")), dip);

@@ -16,6 +16,8 @@ const SIDE: usize = 2 * REACH / STRIDE + 1;
 /// A difference of colour, summed over the channels, at which a neighbour counts 1/e.
 const LIKE_COLOUR: f32 = 30.0;
 const LIKE_PLACE_PX: f32 = 5.0;
+/// Relative difference of depth beyond which the near side is a rim.
+const RIM: f32 = 0.04;
 const MAX_DIFFERENCE: usize = 3 * 255;
 
 /// Bits of a positive f32 below those that number its bin: 32 bins an octave, 2 to 3 % wide.
@@ -51,7 +53,7 @@ pub(super) fn is_near_rim(
     x: usize,
     y: usize,
 ) -> bool {
-    let farthest = depth[y * width + x] * (1.0 + JUMP);
+    let farthest = depth[y * width + x] * (1.0 + RIM);
     (y.saturating_sub(1)..(y + 2).min(height)).any(|row| {
         let columns = x.saturating_sub(1)..(x + 2).min(width);
         depth[row * width..][columns].iter().any(|d| *d > farthest)

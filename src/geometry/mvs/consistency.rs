@@ -91,6 +91,8 @@ struct Other<'a> {
     raw: &'a RawDepth,
     rotation: DMat3,
     translation: DVec3,
+    /// Of the other camera, in this one.
+    centre: DVec3,
 }
 
 impl<'a> Other<'a> {
@@ -101,6 +103,7 @@ impl<'a> Other<'a> {
             raw,
             rotation: other_from_cam.rotation_matrix(),
             translation: other_from_cam.translation,
+            centre: other_from_cam.inverse().translation,
         })
     }
 }
@@ -118,8 +121,9 @@ fn agreement(
     others: &[Other<'_>],
 ) -> Agreement {
     let (mut n, mut sum) = (0, depth);
+    let point = intrinsics.ray_in_cam(pixel) * depth;
     for other in others {
-        if let Verdict::Agrees(back) = other.verdict(intrinsics, pixel, depth, STEREO) {
+        if let Verdict::Agrees(back) = other.verdict(intrinsics, pixel, point, STEREO) {
             n += 1;
             sum += back;
         }
@@ -141,32 +145,36 @@ enum Verdict {
 }
 
 impl Other<'_> {
+    /// Of the point in the camera of `intrinsics` that `pixel` shows.
     fn verdict(
         &self,
         intrinsics: &Intrinsics,
         pixel: glam::DVec2,
-        depth: f64,
+        point: DVec3,
         tolerance: Tolerance,
     ) -> Verdict {
-        let in_other = self.rotation * (intrinsics.ray_in_cam(pixel) * depth) + self.translation;
-        if self.translation.length_squared() < (MIN_ANGLE_RAD * depth).powi(2) {
+        if self.translation.length_squared() < (MIN_ANGLE_RAD * point.z).powi(2) {
             return Verdict::Silent;
         }
+        let in_other = self.rotation * point + self.translation;
         let Some(at) = self.raw.intrinsics.project(in_other) else {
             return Verdict::Silent;
         };
         let Some(found) = depth_at(self.raw, at) else {
             return Verdict::Silent;
         };
-        let seen = self.raw.intrinsics.ray_in_cam(at) * f64::from(found);
-        let back = self.rotation.transpose() * (seen - self.translation);
-        let is_near = intrinsics
-            .project(back)
-            .is_some_and(|landed| (landed - pixel).length_squared() < tolerance.return_px.powi(2));
-        if is_near && (back.z - depth).abs() < tolerance.depth * depth {
+        // What the other sees lies on its ray through the point.
+        let found = f64::from(found);
+        let back = point + (point - self.centre) * (found / in_other.z - 1.0);
+        let lands_near = || {
+            intrinsics.project(back).is_some_and(|landed| {
+                (landed - pixel).length_squared() < tolerance.return_px.powi(2)
+            })
+        };
+        if (back.z - point.z).abs() < tolerance.depth * point.z && lands_near() {
             return Verdict::Agrees(back.z);
         }
-        if f64::from(found) > in_other.z * (1.0 + tolerance.depth) {
+        if found > in_other.z * (1.0 + tolerance.depth) {
             return Verdict::Contradicts;
         }
         Verdict::Silent
@@ -189,8 +197,9 @@ pub(super) fn votes(
         let mut counts = [0_u8; 2];
         if *depth > 0.0 && depth.is_finite() {
             let pixel = glam::DVec2::new((at % width) as f64 + 0.5, (at / width) as f64 + 0.5);
+            let point = raw.intrinsics.ray_in_cam(pixel) * f64::from(*depth);
             for other in &others {
-                match other.verdict(&raw.intrinsics, pixel, f64::from(*depth), tolerance) {
+                match other.verdict(&raw.intrinsics, pixel, point, tolerance) {
                     Verdict::Agrees(_) => counts[0] = counts[0].saturating_add(1),
                     Verdict::Contradicts => counts[1] = counts[1].saturating_add(1),
                     Verdict::Silent => {}

@@ -16,7 +16,7 @@ use super::sweep::Warp;
 use super::zncc::{NOISE_VARIANCE, WINDOW, integer};
 
 /// Relative difference of depth that is a jump.
-pub(super) const JUMP: f32 = 0.04;
+pub(super) const JUMP: f32 = 0.025;
 /// Reach of the matching window: pixels further from a jump are none of its business.
 const REACH: usize = WINDOW / 2;
 const RADIUS: usize = 2;
@@ -30,22 +30,41 @@ const LIKE_LUMA: f32 = 10.0 / 255.0;
 const LEAST_LIKE: f32 = 0.02;
 /// Of a score, what the differences of luma say; the rest is ZNCC, to which a bright rim alone can look right. A larger
 /// share costs depth where the light differs from place to place.
-const LUMA_SHARE: f32 = 0.6;
+const LUMA_SHARE: f32 = 0.7;
 /// A mean difference of luma from which on the window says no.
-const MOST_OFF: f32 = 0.05;
+const MOST_OFF: f32 = 0.03;
 /// A depth that matches worse is none.
 const MIN_SCORE: f32 = 0.25;
 
 /// Replaces the depths near jumps; 0 where none of those around matches.
+///
+/// Twice: what was chosen for the neighbours tells more of what there is to choose from.
 pub(super) fn settle(reference: &Prepared, warps: &[Warp<'_>], depth: &mut [f32]) {
-    let before = depth.to_vec();
+    let first = depth.to_vec();
+    choose(reference, warps, &first, None, depth);
+    let second = depth.to_vec();
+    choose(reference, warps, &second, Some(&first), depth);
+}
+
+/// `earlier`: the depths that have been chosen from already. Where the choice is the same, so is what is chosen.
+fn choose(
+    reference: &Prepared,
+    warps: &[Warp<'_>],
+    before: &[f32],
+    earlier: Option<&[f32]>,
+    depth: &mut [f32],
+) {
     let width = reference.grey.width;
     let rows = depth.par_chunks_mut(width).enumerate();
     rows.for_each(|(y, row)| {
         for (x, value) in row.iter_mut().enumerate() {
             let own = before[y * width + x];
             if own > 0.0
-                && let Some(others) = across_jump(&before, [x, y], own, reference)
+                && let Some(others) = across_jump(before, [x, y], own, reference)
+                && !earlier.is_some_and(|earlier| {
+                    let own = earlier[y * width + x];
+                    across_jump(earlier, [x, y], own, reference) == Some(others)
+                })
             {
                 *value = chosen(reference, warps, [x, y], own, others);
             }
@@ -98,9 +117,13 @@ fn chosen(
 
 /// Neighbours of a pixel, by how much they are like it.
 struct Support {
-    weights: [f32; SIDE * SIDE],
-    values: [f32; SIDE * SIDE],
+    /// Its number in the depth map, and its luma there.
+    pixel: usize,
+    luma: f32,
+    /// They add up to 1; 0 in lanes beyond the window.
+    weights: Lanes,
     mean: f32,
+    off_mean: Lanes,
     variance: f32,
 }
 
@@ -113,23 +136,24 @@ impl Support {
         let down = Vec2::new(0.0, (STEP_PX * scale.y) as f32);
         let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
         let seen = sampled(fine, corner, right, down);
-        let values: [f32; SIDE * SIDE] = std::array::from_fn(|k| seen[k]);
-        let own = values[SIDE * SIDE / 2];
+        let own = seen[SIDE * SIDE / 2];
         let like = |value: f32| (-(value - own).abs() / LIKE_LUMA).exp().max(LEAST_LIKE);
-        let mut weights = values.map(like);
+        let mut weights = [0.0; LANES];
+        let window = weights.iter_mut().zip(seen).take(SIDE * SIDE);
+        window.for_each(|(weight, value)| *weight = like(value));
         let total: f32 = weights.iter().sum();
         weights.iter_mut().for_each(|w| *w /= total);
-        let mean: f32 = weights.iter().zip(&values).map(|(w, v)| w * v).sum();
-        let variance: f32 = weights
-            .iter()
-            .zip(&values)
-            .map(|(w, v)| w * (v - mean).powi(2))
-            .sum();
+        let mean: f32 = weights.iter().zip(&seen).map(|(w, v)| w * v).sum();
+        let off_mean = seen.map(|value| value - mean);
+        let spread = weights.iter().zip(&off_mean).map(|(w, off)| w * off * off);
+        let pixel = y * grey.width + x;
         Self {
+            pixel,
+            luma: grey.values[pixel],
             weights,
-            values,
             mean,
-            variance: variance + NOISE_VARIANCE,
+            off_mean,
+            variance: spread.sum::<f32>() + NOISE_VARIANCE,
         }
     }
 
@@ -171,21 +195,45 @@ impl Support {
             down.as_vec2() / RADIUS as f32,
         );
         let corner = centre.as_vec2() - (right + down) * RADIUS as f32;
-        Some(self.score_of(&sampled(warp.fine, corner, right, down), warp.light))
+        let light = warp.light_at(self.pixel, self.luma);
+        Some(self.score_of(&sampled(warp.fine, corner, right, down), light))
     }
 
-    fn score_of(&self, seen: &[f32; LANES], light: Light) -> f32 {
-        let mean: f32 = self.weights.iter().zip(seen).map(|(w, v)| w * v).sum();
-        let (mut variance, mut covariance, mut off) = (NOISE_VARIANCE, 0.0, 0.0);
-        for ((weight, own), other) in self.weights.iter().zip(&self.values).zip(seen) {
-            variance += weight * (other - mean).powi(2);
-            covariance += weight * (own - self.mean) * (other - mean);
-            off += weight * (light.of_source(*own) - other).abs();
-        }
+    fn score_of(&self, seen: &Lanes, light: Light) -> f32 {
+        let offset = light.of_source(self.mean) - self.mean;
+        let [mean, square, covariance, off] = self.sums(seen, light.gain, offset);
+        let variance = (square - mean * mean).max(0.0) + NOISE_VARIANCE;
         let zncc = covariance / (self.variance * variance).sqrt();
         let like = 1.0 - (off / MOST_OFF).min(1.0);
         zncc + LUMA_SHARE * (like - zncc)
     }
+
+    /// Weighted sums of `d`, what is seen less the mean: d, d^2, d times the own difference from the mean, and how far
+    /// d is from where `gain` and `offset` take that difference.
+    fn sums(&self, seen: &Lanes, gain: f32, offset: f32) -> [f32; 4] {
+        weighted_sums(
+            [&self.weights, &self.off_mean, seen],
+            [self.mean, gain, offset],
+        )
+    }
+}
+
+/// Added up by lanes.
+#[multiversion(targets("x86_64+avx2"))]
+fn weighted_sums([weights, own, seen]: [&Lanes; 3], [mean, gain, offset]: [f32; 3]) -> [f32; 4] {
+    let [mut first, mut square, mut product, mut off] = [[0.0_f32; REGISTER]; 4];
+    for block in 0..LANES / REGISTER {
+        for lane in 0..REGISTER {
+            let k = block * REGISTER + lane;
+            let d = seen[k] - mean;
+            let weighted = weights[k] * d;
+            first[lane] += weighted;
+            square[lane] += weighted * d;
+            product[lane] += weighted * own[k];
+            off[lane] += weights[k] * (gain * own[k] + offset - d).abs();
+        }
+    }
+    [first, square, product, off].map(|lanes| lanes.iter().sum())
 }
 
 /// Pixels of the finer picture to one of the depth map.
@@ -203,10 +251,12 @@ fn in_finer(pixel: DVec2, scale: DVec2) -> DVec2 {
 
 /// A window, filled up to whole registers.
 const LANES: usize = (SIDE * SIDE).next_multiple_of(16);
+const REGISTER: usize = 8;
+type Lanes = [f32; LANES];
 
 /// Bilinear values of a window, row by row. Beyond the border the outermost pixels go on.
 #[multiversion(targets("x86_64+avx2"))]
-fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> [f32; LANES] {
+fn sampled(source: &Grey, corner: Vec2, right: Vec2, down: Vec2) -> Lanes {
     let (mut index, mut share_x, mut share_y) = ([0_u32; LANES], [0.0; LANES], [0.0; LANES]);
     let last = [source.width - 2, source.height - 2].map(|cell| cell as f32);
     let (mut columns, mut rows) = ([0.0_f32; LANES], [0.0_f32; LANES]);

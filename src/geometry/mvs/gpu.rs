@@ -196,13 +196,13 @@ impl Room {
                 width_px: warp.source.width as u32,
                 height_px: warp.source.height as u32,
                 first: first as u32,
-                gain: warp.light.gain,
-                offset: warp.light.offset,
-                ..types::Warp::default()
+                shown: (first + warp.source.values.len()) as u32,
             };
             gpu.write(&self.warps, ix, &[there]);
             gpu.write(&self.luma, first, &warp.source.values);
             first += warp.source.values.len();
+            gpu.write(&self.luma, first, &warp.shown);
+            first += warp.shown.len();
             let starts: Vec<[f32; 4]> = (0..planes.n)
                 .map(|plane| warp.homogeneous(0.0, 0.0, planes.inverse_depth(plane as f64)))
                 .map(|start| rounded(start.to_array()))
@@ -220,7 +220,10 @@ impl Sizes {
             "mvs.n_depths goes to {MAX_SWEEP_PLANES}"
         );
         let n_pixels = task.reference.grey.values.len();
-        let of_sources = task.warps.iter().map(|warp| warp.source.values.len());
+        let of_sources = task
+            .warps
+            .iter()
+            .map(|warp| warp.source.values.len() + warp.shown.len());
         Self {
             n_pixels,
             n_luma: n_pixels + of_sources.sum::<usize>(),

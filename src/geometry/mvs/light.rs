@@ -1,7 +1,8 @@
 //! Luma of a source by that of the reference, where exposure or lamps differ between them.
 //!
 //! A coarse sweep by windows alone, which no change of light disturbs, finds depth; the pairs of pixels that it finds say
-//! how luma goes over into luma. Without that a pixel could not be told by its own luma in pictures of a camera that
+//! how luma goes over into luma: by one gain and offset, and by what is left in each part of the picture (sheen, shade,
+//! a lens darker towards its rim). Without that a pixel could not be told by its own luma in pictures of a camera that
 //! sets its exposure by itself.
 
 use super::grey::Grey;
@@ -27,6 +28,13 @@ const MOST_GAIN: f32 = 0.3;
 const MIN_FALL: f32 = 1.3;
 /// A median difference that is as good as none: a quarter of a grey level.
 const NO_DIFFERENCE: f32 = 0.001;
+/// Side of a part of the picture, in coarse pixels.
+const PART: usize = 8;
+/// Fewer pairs say nothing of a part; as many others without an offset are added to those that are there.
+const MIN_PAIRS_OF_PART: usize = 6;
+/// A part's offset must stand out so far from the scatter of its median: wrong pairs scatter widely.
+const MIN_SIGNIFICANCE: f32 = 6.0;
+const MOST_OF_PART: f32 = 0.1;
 
 /// `luma of the source = gain * luma of the reference + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,11 +53,63 @@ impl Light {
         self.gain * luma + self.offset
     }
 
+    fn between(pairs: &[Pair]) -> Self {
+        if pairs.len() < MIN_PAIRS {
+            return Self::SAME;
+        }
+        let fitted = Self::fitted(pairs);
+        let off = |light: Self| {
+            let off = pairs.iter().map(|pair| pair.off(light).abs());
+            median(off.collect())
+        };
+        let is_better = off(Self::SAME) > MIN_FALL * off(fitted).max(NO_DIFFERENCE);
+        if is_better { fitted } else { Self::SAME }
+    }
+
+    /// Through the medians of the darker and the brighter half.
+    fn fitted(pairs: &[Pair]) -> Self {
+        let mut pairs = pairs.to_vec();
+        pairs.sort_by(|a, b| a.own.total_cmp(&b.own));
+        let (dark, bright) = pairs.split_at(pairs.len() / 2);
+        let luma = [dark, bright].map(|half| median(half.iter().map(|p| p.own).collect()));
+        let more =
+            [dark, bright].map(|half| median(half.iter().map(|p| p.off(Self::SAME)).collect()));
+        let range = luma[1] - luma[0];
+        let slope = if range > MIN_RANGE {
+            ((more[1] - more[0]) / range).clamp(-MOST_GAIN, MOST_GAIN)
+        } else {
+            0.0
+        };
+        Self {
+            gain: 1.0 + slope,
+            offset: 0.5 * (more[0] + more[1] - slope * (luma[0] + luma[1])),
+        }
+    }
+}
+
+/// The light of a source over the picture of the reference.
+#[derive(Debug, Clone)]
+pub(super) struct Lighting {
+    pub(super) overall: Light,
+    /// What is to be added in each part of the picture, `columns` by `rows`.
+    parts: Vec<f32>,
+    columns: usize,
+    rows: usize,
+}
+
+impl Lighting {
+    pub(super) const SAME: Self = Self {
+        overall: Light::SAME,
+        parts: Vec::new(),
+        columns: 0,
+        rows: 0,
+    };
+
     /// Of each source; the same light where too little is found.
     pub(super) fn of(reference: &Prepared, sources: &[&Prepared], planes: &Planes) -> Vec<Self> {
-        let mut lights = vec![Self::SAME; sources.len()];
+        let mut all = vec![Self::SAME; sources.len()];
         let Some(reference) = coarse(reference) else {
-            return lights;
+            return all;
         };
         let planes = Planes {
             n: N_PLANES.min(planes.n),
@@ -67,48 +127,101 @@ impl Light {
         if !warps.is_empty() {
             let pairs = pairs(&reference.grey, &warps, &planes);
             for (ix, pairs) in found.into_iter().zip(pairs) {
-                lights[ix] = Self::between(&pairs);
+                all[ix] = Self::between(&pairs, (reference.grey.width, reference.grey.height));
             }
         }
-        lights
+        all
     }
 
-    /// From pairs of luma, reference and source.
-    fn between(pairs: &[(f32, f32)]) -> Self {
-        if pairs.len() < MIN_PAIRS {
-            return Self::SAME;
+    /// `size`: of the coarse picture.
+    fn between(pairs: &[Pair], (width, height): (usize, usize)) -> Self {
+        let overall = Light::between(pairs);
+        let (columns, rows) = (width.div_ceil(PART), height.div_ceil(PART));
+        let mut off = vec![Vec::new(); columns * rows];
+        for pair in pairs {
+            let [x, y] = pair.at;
+            off[y / PART * columns + x / PART].push(pair.off(overall));
         }
-        let fitted = Self::fitted(pairs);
-        let off = |light: Self| {
-            let off = pairs.iter().map(|(r, s)| (light.of_source(*r) - s).abs());
-            median(off.collect())
-        };
-        let is_better = off(Self::SAME) > MIN_FALL * off(fitted).max(NO_DIFFERENCE);
-        if is_better { fitted } else { Self::SAME }
-    }
-
-    /// Through the medians of the darker and the brighter half.
-    fn fitted(pairs: &[(f32, f32)]) -> Self {
-        let mut pairs = pairs.to_vec();
-        pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let (dark, bright) = pairs.split_at(pairs.len() / 2);
-        let luma = [dark, bright].map(|half| median(half.iter().map(|p| p.0).collect()));
-        let more = [dark, bright].map(|half| median(half.iter().map(|p| p.1 - p.0).collect()));
-        let range = luma[1] - luma[0];
-        let slope = if range > MIN_RANGE {
-            ((more[1] - more[0]) / range).clamp(-MOST_GAIN, MOST_GAIN)
-        } else {
-            0.0
-        };
         Self {
-            gain: 1.0 + slope,
-            offset: 0.5 * (more[0] + more[1] - slope * (luma[0] + luma[1])),
+            overall,
+            parts: off.iter().map(|off| offset_of_part(off)).collect(),
+            columns,
+            rows,
         }
+    }
+
+    /// At a pixel of the reference; between the middles of parts it changes evenly.
+    pub(super) fn at(&self, x: usize, y: usize) -> Light {
+        let Light { gain, offset } = self.overall;
+        if self.parts.is_empty() {
+            return self.overall;
+        }
+        let place = |pixel: usize, n: usize| {
+            let place = (pixel as f32 + 0.5) / (PART * COARSE) as f32 - 0.5;
+            let place = place.clamp(0.0, (n - 1) as f32);
+            let first = (place as usize).min(n.saturating_sub(2));
+            (first, (first + 1).min(n - 1), place - first as f32)
+        };
+        let (left, right, x) = place(x, self.columns);
+        let (above, below, y) = place(y, self.rows);
+        let row = |row: usize| {
+            let parts = &self.parts[row * self.columns..];
+            parts[left] + (parts[right] - parts[left]) * x
+        };
+        Light {
+            gain,
+            offset: offset + row(above) + (row(below) - row(above)) * y,
+        }
+    }
+
+    /// The reference's luma as the source shows it.
+    pub(super) fn shown(&self, reference: &Grey) -> Vec<f32> {
+        let pixels = reference.values.iter().enumerate();
+        let (width, same) = (reference.width, self.parts.is_empty());
+        pixels
+            .map(|(ix, luma)| {
+                let light = if same {
+                    self.overall
+                } else {
+                    self.at(ix % width, ix / width)
+                };
+                light.of_source(*luma)
+            })
+            .collect()
     }
 }
 
-/// Luma of even pixels that have found their depth, and of what each source shows there.
-fn pairs(reference: &Grey, warps: &[Warp<'_>], planes: &Planes) -> Vec<Vec<(f32, f32)>> {
+/// 0 where it does not stand out.
+fn offset_of_part(off: &[f32]) -> f32 {
+    let n = off.len() as f32;
+    if off.len() < MIN_PAIRS_OF_PART {
+        return 0.0;
+    }
+    let middle = median(off.to_vec());
+    let scatter = median(off.iter().map(|o| (o - middle).abs()).collect());
+    if middle.abs() < MIN_SIGNIFICANCE * scatter / n.sqrt() {
+        return 0.0;
+    }
+    let held = middle * n / (n + MIN_PAIRS_OF_PART as f32);
+    held.clamp(-MOST_OF_PART, MOST_OF_PART)
+}
+
+/// Luma of a coarse pixel, and of what a source shows there.
+#[derive(Debug, Clone, Copy)]
+struct Pair {
+    at: [usize; 2],
+    own: f32,
+    seen: f32,
+}
+
+impl Pair {
+    fn off(&self, light: Light) -> f32 {
+        self.seen - light.of_source(self.own)
+    }
+}
+
+/// Even pixels that have found their depth, by source.
+fn pairs(reference: &Grey, warps: &[Warp<'_>], planes: &Planes) -> Vec<Vec<Pair>> {
     let costs = matching_costs(reference, warps, planes, 0.0);
     let mut pairs = vec![Vec::new(); warps.len()];
     for (ix, costs) in costs.chunks_exact(planes.n).enumerate() {
@@ -123,8 +236,13 @@ fn pairs(reference: &Grey, warps: &[Warp<'_>], planes: &Planes) -> Vec<Vec<(f32,
         let inverse_depth = planes.inverse_depth(plane as f64);
         for (warp, pairs) in warps.iter().zip(&mut pairs) {
             let at = warp.pixel_in_source(x as f64, y as f64, inverse_depth);
-            if let Some(luma) = at.and_then(|at| nearest(warp.source, at)) {
-                pairs.push((reference.row(y)[x], luma));
+            if let Some(seen) = at.and_then(|at| luma_at(warp.source, at)) {
+                let own = reference.row(y)[x];
+                pairs.push(Pair {
+                    at: [x, y],
+                    own,
+                    seen,
+                });
             }
         }
     }
@@ -136,10 +254,20 @@ fn median(mut values: Vec<f32>) -> f32 {
     *values.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-fn nearest(grey: &Grey, at: glam::DVec2) -> Option<f32> {
-    let (x, y) = (at.x.round(), at.y.round());
-    let inside = x >= 0.0 && y >= 0.0 && x < grey.width as f64 && y < grey.height as f64;
-    inside.then(|| grey.row(y as usize)[x as usize])
+/// Bilinear; `None` beyond the outermost centres.
+fn luma_at(grey: &Grey, at: glam::DVec2) -> Option<f32> {
+    let last = glam::DVec2::new((grey.width - 1) as f64, (grey.height - 1) as f64);
+    if !(at.cmpge(glam::DVec2::ZERO).all() && at.cmple(last).all()) {
+        return None;
+    }
+    let (x, y) = (
+        (at.x as usize).min(grey.width - 2),
+        (at.y as usize).min(grey.height - 2),
+    );
+    let (share_x, share_y) = ((at.x - x as f64) as f32, (at.y - y as f64) as f32);
+    let between = |row: &[f32]| row[x] + (row[x + 1] - row[x]) * share_x;
+    let (above, below) = (between(grey.row(y)), between(grey.row(y + 1)));
+    Some(above + (below - above) * share_y)
 }
 
 /// `None` where too little would be left.
@@ -176,19 +304,17 @@ mod tests {
     use super::*;
 
     /// Luma evenly from -0.4 to 0.4 as a source shows it; every fourth pair is of something else.
-    fn pairs_by(light: Light) -> Vec<(f32, f32)> {
+    fn pairs_by(light: Light) -> Vec<Pair> {
         let luma = (0..400).map(|ix| (ix, -0.4 + 0.002 * ix as f32));
         let source = |(ix, luma): (usize, f32)| {
             let noise = 0.004 * ((ix * 37 % 11) as f32 / 5.0 - 1.0);
             let other = 0.8 * ((ix * 53 % 17) as f32 / 8.0 - 1.0);
-            (
-                luma,
-                if ix % 4 == 0 {
-                    other
-                } else {
-                    light.of_source(luma) + noise
-                },
-            )
+            let right = light.of_source(luma) + noise;
+            Pair {
+                at: [ix % 20, ix / 20],
+                own: luma,
+                seen: if ix % 4 == 0 { other } else { right },
+            }
         };
         luma.map(source).collect()
     }
@@ -211,5 +337,41 @@ mod tests {
         });
         few.truncate(MIN_PAIRS - 1);
         assert_eq!(Light::between(&few), Light::SAME);
+    }
+
+    #[test]
+    fn a_part_in_another_light_is_found_and_noise_makes_none() {
+        // 4 parts side by side; the last is brighter, the first holds wrong pairs only.
+        let pair = |ix: usize| {
+            let at = [ix % (4 * PART), ix / (4 * PART)];
+            let own = 0.4 * ((ix * 29 % 31) as f32 / 15.0 - 1.0);
+            let noise = 0.004 * ((ix * 37 % 11) as f32 / 5.0 - 1.0);
+            let seen = match at[0] / PART {
+                0 => 0.4 * ((ix * 53 % 17) as f32 / 8.0 - 1.0),
+                3 => own + 0.05 + noise,
+                _ => own + noise,
+            };
+            Pair { at, own, seen }
+        };
+        let pairs: Vec<Pair> = (0..4 * PART * PART).map(pair).collect();
+        let lighting = Lighting::between(&pairs, (4 * PART, PART));
+        assert_eq!(lighting.overall, Light::SAME);
+        let offset = |column: usize| lighting.at(column * COARSE, 0).offset;
+        let (bright, between) = (offset(4 * PART - 1), offset(3 * PART));
+        assert_eq!([offset(0), offset(PART)], [0.0; 2]);
+        assert!((bright - 0.05).abs() < 0.006, "{bright}");
+        assert!(
+            between > 0.3 * bright && between < 0.7 * bright,
+            "{between}"
+        );
+        let grey = Grey {
+            width: 4 * PART * COARSE,
+            height: 1,
+            values: vec![0.1; 4 * PART * COARSE],
+            colours: Vec::new(),
+        };
+        let shown = lighting.shown(&grey);
+        assert_eq!(shown[0], 0.1);
+        assert!((shown[grey.width - 1] - 0.1 - bright).abs() < 1e-6);
     }
 }

@@ -164,9 +164,10 @@ impl<'a> Task<'a> {
             .take(params.n_sources)
             .unzip();
         (!warps.is_empty()).then(|| {
-            let lights = light::Light::of(reference, &sources, &planes);
-            for (warp, light) in warps.iter_mut().zip(lights) {
-                warp.light = light;
+            let lights = light::Lighting::of(reference, &sources, &planes);
+            for (warp, lighting) in warps.iter_mut().zip(lights) {
+                warp.shown = lighting.shown(&reference.grey);
+                warp.light = lighting.overall;
             }
             Self {
                 reference,

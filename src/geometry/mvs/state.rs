@@ -43,7 +43,7 @@ struct Source {
 }
 
 /// Views that a depth map is checked against.
-const MAX_VERIFIERS: usize = 8;
+const MAX_VERIFIERS: usize = 12;
 /// Points of a depth map that stand for it when neighbours are chosen.
 const MAX_LANDMARKS: usize = 200;
 
@@ -127,12 +127,16 @@ impl MvsState {
     /// Depth that the held keyframes agree on, as far as they have come. `None`: not held.
     pub fn depth_of(&self, keyframe_id: u32) -> Option<DepthMap> {
         let held = self.held.get(&keyframe_id)?;
-        let raw = self.current(held);
+        let raw = RawDepth {
+            score: held.raw.score.clone(),
+            margin: held.raw.margin.clone(),
+            ..self.current_depth(held)
+        };
         let verifiers = self.verifiers_of(keyframe_id, held, &raw);
         let others: Vec<(Rigid, RawDepth)> = verifiers
             .iter()
             .filter_map(|id| self.held.get(id))
-            .map(|other| (other.prepared.world_from_cam, self.current(other)))
+            .map(|other| (other.prepared.world_from_cam, self.current_depth(other)))
             .collect();
         let others: Vec<(Rigid, &RawDepth)> =
             others.iter().map(|(pose, raw)| (*pose, raw)).collect();
@@ -207,13 +211,15 @@ impl MvsState {
         self.held.contains_key(&keyframe_id)
     }
 
-    /// Raw depth in the unit and with the lens of this moment.
-    fn current(&self, held: &Held) -> RawDepth {
+    /// Raw depth in the unit and with the lens of this moment; without scores, which verifiers need not.
+    fn current_depth(&self, held: &Held) -> RawDepth {
         let scale = self.scale_since_sweep(held) as f32;
-        let mut raw = held.raw.clone();
-        raw.intrinsics = held.prepared.intrinsics;
-        raw.depth.iter_mut().for_each(|depth| *depth *= scale);
-        raw
+        RawDepth {
+            intrinsics: held.prepared.intrinsics,
+            depth: held.raw.depth.iter().map(|depth| depth * scale).collect(),
+            score: Vec::new(),
+            margin: Vec::new(),
+        }
     }
 
     /// Bundle adjustment and loop closure stretch the map: the distances to the sources tell by how much.

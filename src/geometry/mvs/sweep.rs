@@ -28,6 +28,8 @@ pub(super) struct Warp<'a> {
     pub(super) pixel_map: [[f64; 3]; 3],
     shift: [f64; 3],
     pub(super) light: Light,
+    /// Luma of the reference as the source shows it: by the light, and by what each part of the picture adds.
+    pub(super) shown: Vec<f32>,
 }
 
 impl<'a> Warp<'a> {
@@ -55,6 +57,7 @@ impl<'a> Warp<'a> {
             ],
             shift: project(source_from_reference.translation),
             light: Light::SAME,
+            shown: reference.grey.values.clone(),
         };
         let middle = 0.5 * (planes.inverse_near + planes.inverse_far);
         let angle = source_from_reference.translation.length() * middle;
@@ -96,6 +99,15 @@ impl<'a> Warp<'a> {
     ) -> Option<glam::DVec2> {
         let h = self.homogeneous(x, y, inverse_depth);
         (h.z > 1e-9).then(|| h.truncate() / h.z)
+    }
+
+    /// At a pixel of the reference, by its number and its luma.
+    pub(super) fn light_at(&self, pixel: usize, luma: f32) -> Light {
+        let gain = self.light.gain;
+        Light {
+            gain,
+            offset: self.shown[pixel] - gain * luma,
+        }
     }
 
     pub(super) fn row(&self, y: usize, inverse_depth: f64) -> WarpedRow {

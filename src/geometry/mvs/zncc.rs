@@ -3,7 +3,6 @@
 use multiversion::multiversion;
 
 use super::grey::Grey;
-use super::light::Light;
 use super::sweep::Warp;
 
 /// Side of the matching window in pixels. A wider one makes things wider; smoothness takes care of the noise.
@@ -26,7 +25,7 @@ pub(super) const NOISE_VARIANCE: f32 = (1.0 / 255.0) * (1.0 / 255.0);
 pub(super) const UNSEEN_ZNCC: f32 = 0.2;
 
 /// Of a score, what the pixel itself says; the rest is ZNCC.
-pub(super) const OWN_SHARE: f32 = 0.3;
+pub(super) const OWN_SHARE: f32 = 0.4;
 
 /// A difference of luma from which on the pixel itself says no.
 pub(super) const MOST_OFF: f32 = 0.03;
@@ -151,13 +150,8 @@ pub(super) fn plane_costs(
             let slot = (centre % WINDOW) * stride;
             let own = &ring.values[slot..slot + width];
             let slack = &statistics.slack[at.start..at.start + width];
-            likeness(
-                reference.row(centre),
-                own,
-                slack,
-                warp.light,
-                &mut scratch.likeness,
-            );
+            let shown = &warp.shown[centre * width..(centre + 1) * width];
+            likeness(shown, own, slack, &mut scratch.likeness);
             window_scores(
                 of_reference,
                 &ring.seen[slot..slot + stride],
@@ -270,12 +264,12 @@ fn column_sums(reference: &Grey, ring: &Ring, rows: std::ops::Range<usize>, scra
     }
 }
 
-/// What the pixels themselves say: 1 alike, 0 not.
+/// What the pixels themselves say: 1 alike, 0 not. `shown`: the reference in the light of the source.
 #[multiversion(targets("x86_64+avx2"))]
-fn likeness(reference: &[f32], source: &[f32], slack: &[f32], light: Light, into: &mut [f32]) {
-    let pairs = reference.iter().zip(source).zip(slack);
+fn likeness(shown: &[f32], source: &[f32], slack: &[f32], into: &mut [f32]) {
+    let pairs = shown.iter().zip(source).zip(slack);
     for (((own, other), slack), like) in pairs.zip(into) {
-        let off = ((light.of_source(*own) - other).abs() - slack).max(0.0);
+        let off = ((own - other).abs() - slack).max(0.0);
         *like = 1.0 - (off / MOST_OFF).min(1.0);
     }
 }
