@@ -17,6 +17,7 @@ use splat_mapper::frame::RgbImage;
 use splat_mapper::gpu::device::Wanted;
 use splat_mapper::pose::Rigid;
 use splat_mapper::splat::cpu::CpuEngine;
+use splat_mapper::splat::mcmc::Copies;
 use splat_mapper::splat::wgpu::WgpuEngine;
 use splat_mapper::splat::{
     Engine, McmcSettings, PoseStep, RefinerSettings, Splats, StepSettings, TrainingView,
@@ -68,6 +69,7 @@ fn main() -> anyhow::Result<()> {
         if n.is_multiple_of(MOVE_EVERY) {
             engine.relocate_and_grow(&McmcSettings {
                 min_opacity: 0.005,
+                copies: Copies::Picture,
                 max_splats: MAX_SPLATS,
                 growth: 1.05,
                 active_steps: 0,

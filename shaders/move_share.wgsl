@@ -8,6 +8,8 @@
 const MAX_SHARES: u32 = 51u;
 // Largest opacity whose logit is finite in f32.
 const MAX_OPACITY: f32 = 0.9999999;
+// Halvings of the bracket around an opacity.
+const N_HALVINGS: u32 = 24u;
 // Nodes of the integral over a Gaussian and their distance.
 const N_NODES: u32 = 36u;
 const NODE_STEP: f32 = 0.125;
@@ -47,6 +49,52 @@ fn root_of(opacity: f32, n: u32) -> f32 {
     return 1.0 - exp(x);
 }
 
+fn held(opacity: f32) -> f32 {
+    return min(max(opacity, moves.min_opacity), MAX_OPACITY);
+}
+
+// Sums over the picture of the alpha of n copies together, and of its square.
+fn sums_of_copies(opacity: f32, n: u32) -> vec2<f32> {
+    var all_alpha = 0.0;
+    var first = 0.0;
+    var all = 0.0;
+    for (var k = 1u; k <= 2u * n; k += 1u) {
+        all_alpha += (1.0 - all_alpha) * opacity;
+        all += all_alpha / f32(k);
+        if k == n {
+            first = all;
+        }
+    }
+    return vec2<f32>(first, 2.0 * first - all);
+}
+
+// Opacity of each of n copies, and the factor on the scale.
+fn shared_by_picture(opacity: f32, n: u32) -> vec2<f32> {
+    var low = 0.0;
+    var high = root_of(opacity, n);
+    for (var halving = 0u; halving < N_HALVINGS; halving += 1u) {
+        let middle = 0.5 * (low + high);
+        let sums = sums_of_copies(middle, n);
+        if sums.y > 0.5 * opacity * sums.x {
+            high = middle;
+        } else {
+            low = middle;
+        }
+    }
+    let shared_opacity = held(0.5 * (low + high));
+    return vec2<f32>(shared_opacity, sqrt(opacity / sums_of_copies(shared_opacity, n).x));
+}
+
+fn shared_by_line(opacity: f32, n: u32) -> vec2<f32> {
+    let shared_opacity = held(root_of(opacity, n));
+    var sum = 0.5 * stacked(shared_opacity, n);
+    for (var node = 1u; node < N_NODES; node += 1u) {
+        let t = NODE_STEP * f32(node);
+        sum += stacked(shared_opacity * exp(-t * t), n);
+    }
+    return vec2<f32>(shared_opacity, opacity / (2.0 / SQRT_PI * NODE_STEP * sum));
+}
+
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let splat_ix = flat(group, groups) * 256u + lane;
@@ -56,15 +104,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let n = min(shares[splat_ix] + 1u, MAX_SHARES);
     let at = 4u * splat_ix;
     let opacity = 1.0 / (1.0 + exp(-geometry[at].w));
-    let shared_opacity = min(max(root_of(opacity, n), moves.min_opacity), MAX_OPACITY);
-    var sum = 0.5 * stacked(shared_opacity, n);
-    for (var node = 1u; node < N_NODES; node += 1u) {
-        let t = NODE_STEP * f32(node);
-        sum += stacked(shared_opacity * exp(-t * t), n);
+    var copy = vec2<f32>(0.0);
+    if moves.by_picture == 1u {
+        copy = shared_by_picture(opacity, n);
+    } else {
+        copy = shared_by_line(opacity, n);
     }
-    let factor = opacity / (2.0 / SQRT_PI * NODE_STEP * sum);
-    geometry[at].w = log(shared_opacity / (1.0 - shared_opacity));
+    geometry[at].w = log(copy.x / (1.0 - copy.x));
     let scale = geometry[at + 2u];
-    geometry[at + 2u] = vec4<f32>(scale.xyz + log(factor), 0.0);
+    geometry[at + 2u] = vec4<f32>(scale.xyz + log(copy.y), 0.0);
     clear_moments(splat_ix);
 }

@@ -13,9 +13,10 @@ struct Moves {
     n_steps: u32,
     sh_stored: u32,
     min_opacity: f32,
-    padding_0: f32,
-    padding_1: f32,
-    padding_2: f32,
+    // What copies keep: 1 the sums over the picture, 0 what a line gathers.
+    by_picture: u32,
+    padding_0: u32,
+    padding_1: u32,
 }
 
 const NOBODY: u32 = 0xffffffffu;

@@ -173,6 +173,13 @@ pub enum DepthLoss {
     PaperAlpha,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CopiesKeep {
+    Picture,
+    Line,
+}
+
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MapParams {
@@ -198,6 +205,7 @@ pub struct MapParams {
     pub mcmc_every: u64,
     pub mcmc_start: u64,
     pub growth: f32,
+    pub copies: CopiesKeep,
     pub noise: f32,
     pub opacity_reg: f32,
     pub scale_reg: f32,

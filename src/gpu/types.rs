@@ -123,9 +123,9 @@ pub struct Moves {
     pub n_steps: u32,
     pub sh_stored: u32,
     pub min_opacity: f32,
-    pub padding_0: f32,
-    pub padding_1: f32,
-    pub padding_2: f32,
+    pub by_picture: u32,
+    pub padding_0: u32,
+    pub padding_1: u32,
 }
 
 /// `Sweep` of `shaders/lib/sweep.wgsl`.

@@ -3,11 +3,13 @@
 use rand::RngExt;
 
 use crate::camera::Intrinsics;
+use crate::config::CopiesKeep;
 use crate::map::SplatMap;
 use crate::map::schedule::Phase;
 use crate::map::seed::{self, SeedView};
 use crate::map::transient;
 use crate::pose::Rigid;
+use crate::splat::mcmc::Copies;
 use crate::splat::{McmcSettings, Rendering, Splats};
 
 /// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
@@ -107,6 +109,10 @@ impl SplatMap {
         let active_steps = (ACTIVE_ROUNDS * self.trainable.len()).max(MIN_ACTIVE_STEPS);
         let settings = McmcSettings {
             min_opacity: self.params.min_opacity,
+            copies: match self.params.copies {
+                CopiesKeep::Picture => Copies::Picture,
+                CopiesKeep::Line => Copies::Line,
+            },
             max_splats: self.cap(),
             growth: self.params.growth,
             active_steps: active_steps as u32,

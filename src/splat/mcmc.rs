@@ -12,6 +12,8 @@ pub const MAX_OPACITY: f32 = 1.0 - f32::EPSILON;
 /// Third word of the hash: which draw it is for.
 pub const RELOCATION: u32 = 0;
 pub const GROWTH: u32 = 1;
+/// Halvings of the bracket around an opacity: as many as f32 has bits.
+const N_HALVINGS: u32 = 24;
 /// Nodes of the integral over a Gaussian and their distance: what is left out and what falls between is below 1e-7.
 const N_NODES: u16 = 36;
 const NODE_STEP: f32 = 0.125;
@@ -55,16 +57,74 @@ pub fn normal3(words: [u32; 3]) -> [f32; 3] {
     [first * cos, first * sin, second * (TAU * uniform(d)).cos()]
 }
 
-/// Opacity of each of `n` splats at one place that replace one of `opacity`, and the factor on its scale.
-///
+/// What splats at one place keep of the one that they replace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Copies {
+    /// The sum of its alpha over the picture, and that of alpha squared: of an opaque splat a third of the paper's change.
+    Picture,
+    /// The peak, and what a line through its middle gathers, as the paper has it.
+    Line,
+}
+
+impl Copies {
+    /// Opacity of each of `n` splats at one place that replace one of `opacity`, and the factor on its scale. Where
+    /// `min_opacity` holds the opacity, the factor is that of the opacity held.
+    pub fn shared(self, opacity: f32, n: u32, min_opacity: f32) -> (f32, f32) {
+        match self {
+            Self::Picture => shared_by_picture(opacity, n, min_opacity),
+            Self::Line => shared_by_line(opacity, n, min_opacity),
+        }
+    }
+}
+
+/// With `u = o' exp(-r^2/2)`, all alphas of `n` copies together, `1 - (1 - u)^n`, sum up to `H(n)` over the picture and
+/// their squares to `2 H(n) - H(2n)`, in units of `2 pi` and the scale squared, where `H(n)` is the sum over k from 1 to
+/// n of `(1 - (1 - o')^k) / k`. One splat of opacity o has `o` and `o^2 / 2`.
+fn shared_by_picture(opacity: f32, n: u32, min_opacity: f32) -> (f32, f32) {
+    let n = n.clamp(1, MAX_SHARES);
+    // With the paper's opacity the squares are too large.
+    let (mut low, mut high) = (0.0, root(opacity, n));
+    for _ in 0..N_HALVINGS {
+        let middle = 0.5 * (low + high);
+        let (sum, squares) = sums_of_copies(middle, n);
+        if squares > 0.5 * opacity * sum {
+            high = middle;
+        } else {
+            low = middle;
+        }
+    }
+    let shared = held(0.5 * (low + high), min_opacity);
+    (shared, (opacity / sums_of_copies(shared, n).0).sqrt())
+}
+
+/// `H(n)` and `2 H(n) - H(2n)`.
+fn sums_of_copies(opacity: f32, n: u32) -> (f32, f32) {
+    let (mut stacked, mut first, mut all) = (0.0, 0.0, 0.0);
+    for k in 1..=2 * n {
+        stacked += (1.0 - stacked) * opacity;
+        all += stacked / k as f32;
+        if k == n {
+            first = all;
+        }
+    }
+    (first, 2.0 * first - all)
+}
+
+/// Opacity of which `n` together have `opacity`.
+fn root(opacity: f32, n: u32) -> f32 {
+    -((-opacity).ln_1p() / n as f32).exp_m1()
+}
+
+fn held(opacity: f32, min_opacity: f32) -> f32 {
+    // Not clamp(): it asserts on a NaN limit.
+    opacity.max(min_opacity).min(MAX_OPACITY)
+}
+
 /// The factor keeps the alpha that a line through the middle gathers: `o / (2/sqrt(pi) integral of
 /// 1 - (1 - o' exp(-t^2))^n over t > 0)`, equal to the double sum of the paper and without its cancellation.
-/// Where `min_opacity` holds o', the factor is that of the opacity held.
-pub fn relocated(opacity: f32, n: u32, min_opacity: f32) -> (f32, f32) {
+fn shared_by_line(opacity: f32, n: u32, min_opacity: f32) -> (f32, f32) {
     let n = n.clamp(1, MAX_SHARES);
-    let shared = -((-opacity).ln_1p() / n as f32).exp_m1();
-    // Not clamp(): it asserts on a NaN limit.
-    let shared = shared.max(min_opacity).min(MAX_OPACITY);
+    let shared = held(root(opacity, n), min_opacity);
     let mut sum = 0.5 * stacked(shared, n);
     for node in 1..N_NODES {
         let t = NODE_STEP * f32::from(node);

@@ -82,6 +82,7 @@ pub struct RefinerSettings {
 pub struct McmcSettings {
     /// Splats of at most this opacity are dead and move to live ones.
     pub min_opacity: f32,
+    pub copies: mcmc::Copies,
     /// Splats that there may be in all.
     pub max_splats: usize,
     /// Count after growth as a multiple of the count before, 1.05 in the paper; 1: none are added.

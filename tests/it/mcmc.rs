@@ -1,6 +1,6 @@
 //! Arithmetic of MCMC moves against the paper's, and the numbers they are drawn by.
 
-use splat_mapper::splat::mcmc;
+use splat_mapper::splat::mcmc::{self, Copies};
 
 /// Opacity after sharing and factor on the scale, by the paper's double sum.
 fn by_double_sum(opacity: f64, n: u32, min_opacity: f64) -> (f64, f64) {
@@ -28,12 +28,12 @@ fn shares_are_those_of_the_papers_vectors() {
         (0.9, 5, 0.369_043, 0.797_124),
         (0.9, 51, 0.044_145, 0.757_846),
     ] {
-        let found = mcmc::relocated(o, n, 0.005);
+        let found = Copies::Line.shared(o, n, 0.005);
         assert!((found.0 - shared).abs() < 1e-5, "{o}, {n}: {found:?}");
         assert!((found.1 - factor).abs() < 1e-5, "{o}, {n}: {found:?}");
     }
     // Held at the least opacity, the scale takes it all.
-    assert!((mcmc::relocated(0.1, 51, 0.005).1 - 0.4276).abs() < 5e-5);
+    assert!((Copies::Line.shared(0.1, 51, 0.005).1 - 0.4276).abs() < 5e-5);
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn the_integral_is_the_double_sum() {
     ] {
         for n in 1..=51 {
             let (shared, factor) = by_double_sum(f64::from(o), n, 0.005);
-            let found = mcmc::relocated(o, n, 0.005);
+            let found = Copies::Line.shared(o, n, 0.005);
             let error = (f64::from(found.1) - factor).abs();
             assert!((f64::from(found.0) - shared).abs() < 2e-6, "{o}, {n}");
             assert!(error < 1e-5, "{o}, {n}: {} and {factor}", found.1);
@@ -54,15 +54,60 @@ fn the_integral_is_the_double_sum() {
     eprintln!("factor: {worst:.1e}");
 }
 
+/// Sums over the picture of what `n` copies hide together, and of its square, by quadrature, in units of 2 pi and the scale squared.
+fn sums_in_picture(opacity: f64, n: u32, factor: f64) -> [f64; 2] {
+    const STEP: f64 = 1e-3;
+    let mut sums = [0.0; 2];
+    for ring in 0..8000 {
+        let r = (f64::from(ring) + 0.5) * STEP;
+        let one = opacity * (-0.5 * (r / factor).powi(2)).exp();
+        let all = 1.0 - (1.0 - one).powf(f64::from(n));
+        sums[0] += all * r * STEP;
+        sums[1] += all * all * r * STEP;
+    }
+    sums
+}
+
+#[test]
+fn copies_by_the_picture_keep_what_it_sums_up_to() {
+    for o in [0.0051_f32, 0.02, 0.1, 0.5, 0.9, 0.99, 0.999_999] {
+        let before = sums_in_picture(f64::from(o), 1, 1.0);
+        for n in [1, 2, 3, 10, 51] {
+            let (shared, factor) = Copies::Picture.shared(o, n, 0.0);
+            let after = sums_in_picture(f64::from(shared), n, f64::from(factor));
+            for (before, after) in before.iter().zip(after) {
+                assert!(
+                    (after / before - 1.0).abs() < 5e-4,
+                    "{o}, {n}: {after} and {before}"
+                );
+            }
+            let line = Copies::Line.shared(o, n, 0.0);
+            assert!(
+                shared <= line.0 * 1.000_1,
+                "{o}, {n}: {shared} and {}",
+                line.0
+            );
+        }
+    }
+    // Held at the least opacity, the scale takes it all, and keeps the sum.
+    let (shared, factor) = Copies::Picture.shared(0.1, 51, 0.005);
+    let [sum, _] = sums_in_picture(f64::from(shared), 51, f64::from(factor));
+    assert_eq!(shared, 0.005);
+    assert!((sum / 0.1 - 1.0).abs() < 1e-4, "{sum}");
+}
+
 #[test]
 fn one_share_is_the_splat_itself_and_extremes_stay_finite() {
-    let (o, factor) = mcmc::relocated(0.3, 1, 0.005);
-    assert!((o - 0.3).abs() < 1e-6 && (factor - 1.0).abs() < 1e-5);
-    for o in [0.0, 1e-30, 0.005, 0.999_999_9, 1.0] {
-        for n in [0, 1, 2, 51, u32::MAX] {
-            let (shared, factor) = mcmc::relocated(o, n, 0.005);
-            assert!((0.005..=mcmc::MAX_OPACITY).contains(&shared));
-            assert!(factor.is_finite() && factor <= 1.0001, "{o}, {n}: {factor}");
+    for copies in [Copies::Line, Copies::Picture] {
+        let (o, factor) = copies.shared(0.3, 1, 0.005);
+        assert!((o - 0.3).abs() < 1e-6 && (factor - 1.0).abs() < 1e-5);
+        for o in [0.0, 1e-30, 0.005, 0.999_999_9, 1.0] {
+            for n in [0, 1, 2, 51, u32::MAX] {
+                let (shared, factor) = copies.shared(o, n, 0.005);
+                assert!((0.005..=mcmc::MAX_OPACITY).contains(&shared));
+                let fits = factor.is_finite() && factor <= 1.0001;
+                assert!(fits, "{copies:?}, {o}, {n}: {factor}");
+            }
         }
     }
 }

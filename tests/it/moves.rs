@@ -5,14 +5,16 @@ use splat_mapper::eval::trajectory::read_tum;
 use splat_mapper::export::ply;
 use splat_mapper::source::open;
 use splat_mapper::splat::cpu::CpuEngine;
-use splat_mapper::splat::{Engine, McmcSettings, Splats, StepSettings, mcmc};
+use splat_mapper::splat::mcmc::Copies;
+use splat_mapper::splat::{Engine, McmcSettings, Splats, StepSettings};
 
-use crate::backends::ORDINARY;
+use crate::backends::{BACKENDS, ORDINARY};
 use crate::localise::run;
 use crate::reference::random::{self, Recipe, Scene};
 
 const MOVES: McmcSettings = McmcSettings {
     min_opacity: 0.005,
+    copies: Copies::Picture,
     max_splats: 1_000_000,
     growth: 1.0,
     active_steps: 0,
@@ -52,11 +54,17 @@ fn opacity(splats: &Splats, ix: usize) -> f32 {
 }
 
 /// Mean over all pixels and channels of |after - before|, black background, in 8 scenes. Dead splats are invisible and copies
-/// lie where their source lies, as the formula assumes. It keeps the peak and what a line through the middle gathers; off
-/// the middle a stack of opaque splats is wider than one, so the bar depends on how opaque they are.
+/// lie where their source lies, as the formulas assume. A stack of opaque splats has not the shape of one, whatever it
+/// keeps, so the bar depends on how opaque they are.
 #[test]
 fn moving_and_adding_splats_leaves_the_picture_as_it_is() {
-    for (most, growth, bar) in [(0.0, 1.0, 1e-3), (0.0, 1.05, 1e-3), (3.0, 1.05, 4e-3)] {
+    for (copies, most, growth, bar) in [
+        (Copies::Line, 0.0, 1.0, 1e-3),
+        (Copies::Line, 0.0, 1.05, 1e-3),
+        (Copies::Line, 3.0, 1.05, 4e-3),
+        (Copies::Picture, 3.0, 1.0, 1e-3),
+        (Copies::Picture, 3.0, 1.05, 2e-3),
+    ] {
         let mut mean = 0.0;
         for seed in 0..8 {
             let mut scene = scene_with_dead(seed, 200, 20);
@@ -65,22 +73,29 @@ fn moving_and_adding_splats_leaves_the_picture_as_it_is() {
             let mut engine = engine_of(&scene);
             let (intrinsics, pose) = (scene.view.intrinsics, scene.view.cam_from_map);
             let before = engine.render(&intrinsics, &pose, 3).rgb;
-            let n = engine.relocate_and_grow(&McmcSettings { growth, ..MOVES });
+            let moves = McmcSettings {
+                growth,
+                copies,
+                ..MOVES
+            };
+            let n = engine.relocate_and_grow(&moves);
             assert_eq!(n, if growth > 1.0 { 210 } else { 200 });
             let after = engine.render(&intrinsics, &pose, 3).rgb;
             let pairs = before.iter().zip(&after);
             let sum: f64 = pairs.map(|(a, b)| f64::from((a - b).abs())).sum();
             mean += sum / before.len() as f64 / 8.0;
         }
-        eprintln!("logits up to {most}, growth {growth}: a pixel differs by {mean:.1e}");
+        eprintln!(
+            "{copies:?}, logits up to {most}, growth {growth}: a pixel differs by {mean:.1e}"
+        );
         assert!(mean < bar, "{mean:e}");
     }
 }
 
-/// On a trained map, at each of its keyframes: the dead moved, and 5 % added besides, which is one refinement.
-// FIXME: the bar is 1e-3. The dead are seen a little at the shipped limit of 0.02, and copies of opaque splats are wider.
+/// On a trained map, at each of its keyframes: the dead moved as shipped and as in the paper; and with 5 % added
+/// besides, which is one refinement.
 #[test]
-fn moving_the_dead_of_a_trained_map_changes_its_pictures_by_half_a_grey_level_at_most() {
+fn moving_the_dead_of_a_trained_map_changes_its_pictures_by_a_quarter_of_a_grey_level() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().to_str().unwrap();
     let room = "synthetic:room?frames=12&width=160&height=120";
@@ -110,13 +125,18 @@ fn moving_the_dead_of_a_trained_map_changes_its_pictures_by_half_a_grey_level_at
     let mut source = open(room, &params.source, 0).unwrap();
     let lens = source.next().unwrap().intrinsics.unwrap();
     let poses = read_tum(&folder.path().join("keyframes.tum")).unwrap();
-    // Those that a refinement by the shipped parameters moves.
     let min_opacity = params.map.min_opacity;
-    let n_dead = (0..splats.len())
-        .filter(|ix| opacity(&splats, *ix) <= min_opacity)
-        .count();
-    assert!(n_dead > 0);
-    for (growth, bar) in [(1.0, 2e-3), (1.05, 2.5e-3)] {
+    let n_dead = |limit: f32| {
+        (0..splats.len())
+            .filter(|ix| opacity(&splats, *ix) <= limit)
+            .count()
+    };
+    assert!(n_dead(0.005) > 0);
+    for (copies, min_opacity, growth, bar) in [
+        (Copies::Picture, min_opacity, 1.0, 1e-3),
+        (Copies::Line, 0.005, 1.0, 1e-3),
+        (Copies::Picture, min_opacity, 1.05, 1.5e-3),
+    ] {
         let mut engine = CpuEngine::new();
         engine.append(&splats);
         let pictures = |engine: &mut CpuEngine| -> Vec<f32> {
@@ -127,6 +147,7 @@ fn moving_the_dead_of_a_trained_map_changes_its_pictures_by_half_a_grey_level_at
         let before = pictures(&mut engine);
         let n = engine.relocate_and_grow(&McmcSettings {
             min_opacity,
+            copies,
             growth,
             ..MOVES
         });
@@ -135,8 +156,9 @@ fn moving_the_dead_of_a_trained_map_changes_its_pictures_by_half_a_grey_level_at
         let off: f64 = pairs.map(|(a, b)| f64::from((a - b).abs())).sum();
         let mean = off / before.len() as f64;
         eprintln!(
-            "{} splats, {n_dead} of them dead, become {n}: a pixel differs by {mean:.1e}",
-            splats.len()
+            "{copies:?}: {} splats, {} of them dead, become {n}: a pixel differs by {mean:.1e}",
+            splats.len(),
+            n_dead(min_opacity)
         );
         assert!(mean < bar, "{growth}: {mean:e}");
     }
@@ -165,8 +187,39 @@ fn the_dead_become_copies_of_the_living() {
     }
     let n_copies = |ix: u32| after.anchors.iter().filter(|&&a| a == ix).count() as u32;
     for ix in (0..300).filter(|ix| ix % 3 != 0) {
-        let expected = mcmc::relocated(opacity(&scene.splats, ix), n_copies(ix as u32), 0.005).0;
+        let expected = MOVES
+            .copies
+            .shared(opacity(&scene.splats, ix), n_copies(ix as u32), 0.005)
+            .0;
         assert!((opacity(&after, ix) - expected).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn every_backend_makes_the_same_moves() {
+    for copies in [Copies::Picture, Copies::Line] {
+        let scene = scene_with_dead(5, 400, 3);
+        let moves = McmcSettings {
+            growth: 1.1,
+            copies,
+            ..MOVES
+        };
+        let all = BACKENDS.iter().map(|backend| {
+            let mut engine = (backend.engine)();
+            engine.append(&scene.splats);
+            assert_eq!(engine.relocate_and_grow(&moves), 440, "{}", backend.name);
+            engine.splats()
+        });
+        let all: Vec<Splats> = all.collect();
+        for (found, backend) in all.iter().zip(&BACKENDS).skip(1) {
+            assert_eq!(found.anchors, all[0].anchors, "{}", backend.name);
+            for ix in 0..found.len() {
+                let sizes = found.log_scales[ix].iter().zip(all[0].log_scales[ix]);
+                let off = sizes.fold(0.0_f32, |off, (a, b)| off.max((a - b).abs()));
+                let off = off.max((opacity(found, ix) - opacity(&all[0], ix)).abs());
+                assert!(off < 2e-5, "{} {copies:?} {ix}: {off}", backend.name);
+            }
+        }
     }
 }
 

@@ -176,9 +176,9 @@ fn other_shared_structs_have_the_layout_of_the_host() {
         n_steps,
         sh_stored,
         min_opacity,
+        by_picture,
         padding_0,
-        padding_1,
-        padding_2
+        padding_1
     );
     assert_eq!(layout_in("Moves", &kernel("move_draw")), moves);
 }

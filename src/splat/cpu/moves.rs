@@ -100,7 +100,12 @@ impl Moves<'_> {
     /// Makes a splat one of `n` at its place.
     fn share(&mut self, ix: usize, n: u32) {
         let logit = &mut self.splats.opacity_logits[ix];
-        let (opacity, factor) = mcmc::relocated(sigmoid(*logit), n, self.settings.min_opacity);
+        let McmcSettings {
+            copies,
+            min_opacity,
+            ..
+        } = *self.settings;
+        let (opacity, factor) = copies.shared(sigmoid(*logit), n, min_opacity);
         *logit = (opacity / (1.0 - opacity)).ln();
         let by = factor.ln();
         self.splats.log_scales[ix].iter_mut().for_each(|l| *l += by);

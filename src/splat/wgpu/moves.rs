@@ -49,6 +49,7 @@ pub(super) fn relocate_and_grow(
         n_steps,
         sh_stored: u32::from(memory.sh_degree),
         min_opacity: settings.min_opacity,
+        by_picture: u32::from(settings.copies == mcmc::Copies::Picture),
         kind: mcmc::RELOCATION,
         ..Moves::default()
     };
