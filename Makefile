@@ -11,18 +11,21 @@ demo:
 
 test:
 	scripts/setup test
-	cargo test --release --locked
+	cargo test --release --locked --workspace
 
 lint:
 	scripts/setup lint
-	cargo fmt --check
-	cargo clippy --release --locked --all-targets -- -D warnings
+	cargo fmt --check --all
+	cargo clippy --release --locked --workspace --all-targets -- -D warnings
+	target/lint/bin/typos
+	scripts/check_words
+	scripts/architecture_svg --check
 
 # What goes out, read, asked and harassed over zenoh by clients from PyPI.
 zenoh-test:
 	scripts/zenoh_test
 
-# Cameras: boots a kernel with made-up ones in QEMU and holds docs/CAMERAS.md against them. Says so where it is skipped.
+# Cameras: boots a kernel with synthetic ones in QEMU and holds docs/CAMERAS.md against them. Says so where it is skipped.
 v4l2-test:
 	scripts/v4l2_test
 
@@ -35,7 +38,7 @@ bench:
 	scripts/setup build
 	cargo bench --locked --profile release
 
-# The table of what each component is worth, on fox (SPLAT_MAPPER_DATA) and a made-up room; docs/BENCHMARKS.md explains it.
+# The table of what each component is worth, on fox (SPLAT_MAPPER_DATA) and a synthetic room; docs/BENCHMARKS.md explains it.
 ablation:
 	scripts/setup build
 	cargo build --release --locked --bins --example ablation

@@ -1,6 +1,6 @@
 //! Time of each stage of a step and of whole steps, 270x480, by number of splats.
 //!
-//! And of features by kind: a random picture of 640x360 on all cores, and one pair of 2,000 descriptors on one.
+//! And of features by kind: a random image of 640x360 on all cores, and one pair of 2,000 descriptors on one.
 //!
 //! Splats are random, with sizes that give 100 to 280 of them per tile as trained maps have. Whole steps also on the GPU,
 //! which may be software, and in maps of which most lies behind the camera. Depth of a view on both.
@@ -9,27 +9,34 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Duration;
 
-use criterion::{
-    BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main, measurement::WallTime,
-};
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::config::Settings;
-use splat_mapper::frame::{DepthMap, RgbImage};
-use splat_mapper::geometry::features::{Features, orb, sift};
-use splat_mapper::geometry::matching::{Comparable, matches};
-use splat_mapper::geometry::mvs::gpu::GpuMatcher;
-use splat_mapper::geometry::mvs::{self, MvsView};
-use splat_mapper::geometry::scale_space::Grey;
-use splat_mapper::gpu::device::Wanted;
-use splat_mapper::pose::Rigid;
-use splat_mapper::splat::cpu::project_backward::{Forward, SplatGradients, project_backward};
-use splat_mapper::splat::cpu::raster_backward::{InstanceGradients, raster_backward};
-use splat_mapper::splat::cpu::{CpuEngine, bin, loss, project, raster};
-use splat_mapper::splat::wgpu::WgpuEngine;
-use splat_mapper::splat::{Engine, PoseStep, Splats, StepSettings, TrainingView};
+
+use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::cpu::project_backward::{Forward, SplatGradients, project_backward};
+use splat_engine::cpu::raster_backward::{InstanceGradients, raster_backward};
+use splat_engine::cpu::{bin, loss, loss_buffers, project, raster};
+use splat_engine::settings::{PoseMode, StepSettings};
+use splat_engine::traits::{Engine, SplatBuffers as _, Trainer as _, ViewStore as _};
+use splat_engine::view::TrainingView;
+use splat_engine::wgpu::engine::WgpuEngine;
+use splat_geometry::features::descriptor::Features;
+use splat_geometry::features::scale_space::Grey;
+use splat_geometry::features::{orb, sift};
+use splat_geometry::matching::{PreparedDescriptors, matches};
+use splat_geometry::mvs::gpu::GpuMatcher;
+use splat_geometry::mvs::stereo;
+use splat_geometry::mvs::view::MvsView;
+use splat_gpu::device::Wanted;
+use splat_mapper::params::settings::Settings;
+use splat_types::camera::Intrinsics;
+use splat_types::depth::DepthMap;
+use splat_types::image::RgbImage;
+use splat_types::splats::splats::Splats;
+use splat_types::transform::Rigid;
 
 const WIDTH_PX: u32 = 270;
 const HEIGHT_PX: u32 = 480;
@@ -59,9 +66,14 @@ fn stages(c: &mut Criterion) {
         let mut group = c.benchmark_group("step");
         configure(&mut group);
         let mut engine = CpuEngine::new();
-        engine.append(&splats);
-        let view_ix = engine.add_view(view.clone());
-        group.bench_function(name, |b| b.iter(|| engine.step(view_ix, &settings())));
+        engine.append(&splats).expect("a device that stays");
+        let view_ix = engine.add_view(view.clone()).expect("a device that stays");
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                let stepped = engine.step(view_ix, &settings());
+                stepped.expect("a device that stays");
+            });
+        });
         group.finish();
         each_stage(c, name, &splats, &view);
     }
@@ -119,7 +131,7 @@ fn maps(c: &mut Criterion) {
 /// Depth of one view from the multi-view stereo: 320x240, 96 planes, 4 sources.
 fn sweeps(c: &mut Criterion) {
     let mut params = Settings::shipped().params().expect("shipped").mvs;
-    (params.n_depths, params.n_sources) = (96, 4);
+    (params.depth_planes, params.source_views) = (96, 4);
     let views: Vec<MvsView> = (0..5).map(|ix| noise_view(0.1 * f64::from(ix))).collect();
     let sources: Vec<&MvsView> = views[1..].iter().collect();
     let range = (1.0, 6.0);
@@ -127,7 +139,7 @@ fn sweeps(c: &mut Criterion) {
     configure(&mut group);
     group.sample_size(10);
     group.bench_function("cpu", |b| {
-        b.iter(|| mvs::sweep(&views[0], &sources, range, &params));
+        b.iter(|| stereo::sweep(&views[0], &sources, range, &params));
     });
     let wanted = Wanted {
         any_kind: true,
@@ -161,7 +173,7 @@ fn noise_view(x: f64) -> MvsView {
             cx: 160.0,
             cy: 120.0,
         },
-        world_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
+        submap_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
     }
 }
 
@@ -169,7 +181,7 @@ fn features(c: &mut Criterion) {
     const N: usize = 2_000;
     let mut rng = Pcg32::seed_from_u64(3);
     let (width, height) = (640, 360);
-    let mut picture = Grey {
+    let mut image = Grey {
         width,
         height,
         pixels: vec![0.5; width * height],
@@ -178,7 +190,7 @@ fn features(c: &mut Criterion) {
         let (x, y) = (rng.random_range(0..width), rng.random_range(0..height));
         let (size, step) = (rng.random_range(2..30), rng.random_range(-0.2..0.2_f32));
         for row in y..(y + size).min(height) {
-            picture.pixels[row * width..][x..(x + size).min(width)]
+            image.pixels[row * width..][x..(x + size).min(width)]
                 .iter_mut()
                 .for_each(|v| *v = (*v + step).clamp(0.0, 1.0));
         }
@@ -187,9 +199,9 @@ fn features(c: &mut Criterion) {
     for (kind, find) in [("sift", sift::features as Find), ("orb", orb::features)] {
         let mut group = c.benchmark_group(format!("features_{kind}"));
         configure(&mut group);
-        group.bench_function("640x360", |b| b.iter(|| find(black_box(&picture), N)));
+        group.bench_function("640x360", |b| b.iter(|| find(black_box(&image), N)));
         group.finish();
-        let found = Comparable::new(&find(&picture, N).descriptors);
+        let found = PreparedDescriptors::new(&find(&image, N).descriptors);
         let mut group = c.benchmark_group(format!("matches_{kind}"));
         configure(&mut group);
         group.bench_function("2000", |b| b.iter(|| matches(&found, black_box(&found))));
@@ -205,16 +217,20 @@ fn bench_step(
     splats: &[Splats],
     view: TrainingView,
 ) {
-    splats.iter().for_each(|splats| engine.append(splats));
-    let view_ix = engine.add_view(view);
+    splats
+        .iter()
+        .for_each(|splats| engine.append(splats).expect("a device that stays"));
+    let view_ix = engine.add_view(view).expect("a device that stays");
     let mut group = c.benchmark_group(group);
     configure(&mut group);
     group.sample_size(10);
     group.bench_function(name, |b| {
         b.iter(|| {
-            engine.step(view_ix, &settings());
+            engine
+                .step(view_ix, &settings())
+                .expect("a device that stays");
             // Waits: a GPU's step only begins when it is asked for.
-            engine.take_stats()
+            engine.take_stats().expect("a device that stays")
         });
     });
     group.finish();
@@ -222,19 +238,19 @@ fn bench_step(
 
 fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingView) {
     let settings = settings();
-    let camera = project::Camera::new(&view.intrinsics, &view.cam_from_map);
+    let camera = project::Camera::new(&view.intrinsics, &view.cam_from_world);
     let target = loss::Target {
         image: &view.image,
         depth: view.depth.as_deref(),
         mask: None,
         exposure: [[0.0; 3]; 2],
     };
-    let (mut projected, mut tiles, mut picture) = (
+    let (mut projected, mut tiles, mut image) = (
         project::Projected::default(),
         bin::Tiles::default(),
         raster::Raster::default(),
     );
-    let mut pixels = loss::PixelGradients::default();
+    let mut pixels = loss_buffers::PixelGradients::default();
     let (mut instances, mut gradients) = (InstanceGradients::default(), SplatGradients::default());
     let mut bench = |stage: &str, run: &mut dyn FnMut()| {
         // Once outside of the measurement: a filter may leave it out, and the next stage needs the result.
@@ -252,13 +268,13 @@ fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingVie
         bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles);
     });
     bench("raster", &mut || {
-        raster::raster(visible, &tiles, &mut picture);
+        raster::raster(visible, &tiles, &mut image);
     });
     bench("loss", &mut || {
-        black_box(loss::loss(&picture, &target, &settings, &mut pixels));
+        black_box(loss::loss(&image, &target, &settings, &mut pixels));
     });
     bench("raster_backward", &mut || {
-        raster_backward(visible, &tiles, &picture, &pixels, &mut instances);
+        raster_backward(visible, &tiles, &image, &pixels, &mut instances);
     });
     let forward = Forward {
         splats,
@@ -304,7 +320,7 @@ fn settings() -> StepSettings {
         scale_reg: 0.01,
         sh_degree: 3,
         train_splats: true,
-        pose: PoseStep::Direct,
+        pose: PoseMode::Direct,
         ..StepSettings::default()
     }
 }
@@ -358,7 +374,7 @@ fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
             cx: 0.5 * f64::from(WIDTH_PX),
             cy: 0.5 * f64::from(HEIGHT_PX),
         },
-        cam_from_map: Rigid::new(DQuat::IDENTITY, DVec3::ZERO),
+        cam_from_world: Rigid::new(DQuat::IDENTITY, DVec3::ZERO),
         depth: Some(Arc::new(depth)),
         mask: None,
     };

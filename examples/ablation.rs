@@ -1,4 +1,4 @@
-//! The paper's ablation at a small size: the same replays with one component left out each -> a table in Markdown.
+//! The paper's ablation at a small size: the same replays with one submap left out each -> a table in Markdown.
 //!
 //! Runs the program beside it (`cargo build --release` first) with `--preset paper`, disturbed true poses and half of
 //! the views held out, and judges each run with `eval --json`. `make ablation` calls it.
@@ -25,14 +25,14 @@ const ROOM: &str = "synthetic:room?frames=24&width=240&height=180&speed=1.6";
 /// What is left out of the full method: name, settings.
 const VARIANTS: [(&str, &[&str]); 6] = [
     ("full", &[]),
-    ("no MCMC", &["map.mcmc=false"]),
-    ("no depth", &["map.depth_weight=0.0"]),
+    ("no MCMC", &["mcmc.enabled=false"]),
+    ("no depth", &["train.depth_weight=0.0"]),
     (
         "depth as in the paper's code",
-        &["map.depth_mode=paper_code"],
+        &["train.depth_mode=paper_code"],
     ),
-    ("no MLP (poses one by one)", &["map.pose=direct"]),
-    ("poses held", &["map.pose=held"]),
+    ("no MLP (poses one by one)", &["train.pose_opt=per_view"]),
+    ("poses held", &["train.pose_opt=fixed"]),
 ];
 
 /// Prints the ablation table.
@@ -46,7 +46,7 @@ struct Args {
     out: PathBuf,
     #[arg(long, default_value_t = 2000)]
     steps: u64,
-    /// Longer side of the pictures, in pixels
+    /// Longer side of the images, in pixels
     #[arg(long, default_value_t = 240)]
     side: u32,
     #[arg(long, default_value_t = 20_000)]
@@ -131,8 +131,12 @@ fn fox(data: &Path) -> anyhow::Result<Scene> {
     };
     let (train, held_out) = (every_from(0), every_from(STRIDE / 2));
     let settings = vec![
-        format!("source.names={},{}", train.join(","), held_out.join(",")),
-        format!("source.held_out_names={}", held_out.join(",")),
+        format!(
+            "source.include_prefixes={},{}",
+            train.join(","),
+            held_out.join(",")
+        ),
+        format!("source.holdout_prefixes={}", held_out.join(",")),
         "map.holdout=0".to_owned(),
     ];
     Ok(Scene {
@@ -146,7 +150,7 @@ fn fox(data: &Path) -> anyhow::Result<Scene> {
 /// Its truth is what an undisturbed run says of its poses before the first step.
 fn room(program: &Path, args: &Args) -> anyhow::Result<Scene> {
     let truth = args.out.join("room_truth");
-    let settings = ["select.all=true", "map.holdout=0", "map.steps=0"].map(str::to_owned);
+    let settings = ["select.every_frame=true", "map.holdout=0", "train.steps=0"].map(str::to_owned);
     replay(program, args, ROOM, &truth, &settings)?;
     Ok(Scene {
         name: "room",
@@ -171,18 +175,18 @@ fn row(
     let seeds = args.splats / (2 * N_TRAIN as u64);
     let mut all = vec![
         format!("source.max_side={}", 2 * args.side),
-        format!("map.max_side={}", args.side),
-        format!("map.steps={}", args.steps),
+        format!("train.max_side={}", args.side),
+        format!("train.steps={}", args.steps),
         format!("map.max_splats={}", args.splats),
-        format!("map.seeds_per_keyframe={seeds}"),
+        format!("train.seeds_per_keyframe={seeds}"),
         // The preset's intervals, for its 7,000 steps, shortened as the run is.
-        format!("map.sh_interval={}", (args.steps / 7).max(1)),
-        format!("map.mcmc_every={}", (args.steps / 70).max(1)),
-        format!("map.mcmc_start={}", args.steps / 14),
-        "map.depth_mode=inv_depth".to_owned(),
-        format!("known.rotation_noise_deg={}", args.noise_deg),
+        format!("train.sh_interval={}", (args.steps / 7).max(1)),
+        format!("mcmc.every={}", (args.steps / 70).max(1)),
+        format!("mcmc.start={}", args.steps / 14),
+        "train.depth_mode=inv_depth".to_owned(),
+        format!("ground_truth.rotation_noise_deg={}", args.noise_deg),
         format!(
-            "known.translation_noise_extent={}",
+            "ground_truth.translation_noise_extent={}",
             0.01 * args.noise_percent
         ),
     ];
@@ -225,7 +229,14 @@ fn replay(
 ) -> anyhow::Result<()> {
     let mut command = Command::new(program);
     command
-        .args(["replay", input, "--preset", "paper", "--geometry", "known"])
+        .args([
+            "replay",
+            input,
+            "--preset",
+            "paper",
+            "--geometry",
+            "ground_truth",
+        ])
         .arg("--out")
         .arg(out)
         .args(["--seed", &args.seed.to_string()])

@@ -1,4 +1,4 @@
-//! What a model of docs/MODELS.md answers to given pictures, decoded as the node does it: for comparing an export with
+//! What a model of docs/MODELS.md answers to given images, decoded as the node does it: for comparing an export with
 //! the network that it came from.
 
 #![allow(clippy::print_stdout, reason = "a program for people")]
@@ -10,11 +10,12 @@ use anyhow::{Context, bail};
 use clap::Parser;
 use glam::DMat4;
 use serde_json::json;
-use splat_mapper::config::Settings;
-use splat_mapper::geometry::onnx::decode::{Answer, POSE_LENGTH};
-use splat_mapper::geometry::onnx::model::Model;
 
-/// Runs a model on pictures and writes answer.json, depth.f32 and conf.f32
+use splat_geometry::foundation::decode::{Answer, POSE_LENGTH};
+use splat_geometry::foundation::model::Model;
+use splat_mapper::params::settings::Settings;
+
+/// Runs a model on images and writes answer.json, depth.f32 and conf.f32
 #[derive(Debug, Parser)]
 struct Args {
     /// Its description lies beside it as MODEL.json
@@ -23,7 +24,7 @@ struct Args {
     /// S*3*H*W numbers, f32 little endian, from 0 to 1
     #[arg(value_name = "IMAGES.f32")]
     images: PathBuf,
-    /// Number of pictures
+    /// Number of images
     #[arg(value_name = "S")]
     n_frames: usize,
     /// Folder for what comes out
@@ -42,14 +43,14 @@ fn main() -> anyhow::Result<()> {
     }
     let mut model = Model::open(&args.model, &settings.params()?.onnx)?;
     let bytes = fs::read(&args.images)
-        .with_context(|| format!("cannot read the pictures: {}", args.images.display()))?;
+        .with_context(|| format!("cannot read the images: {}", args.images.display()))?;
     let numbers = bytes.chunks_exact(4);
     let images: Vec<f32> = numbers
         .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
         .collect();
     let answer = model.answer(images)?;
     if answer.n_frames != args.n_frames {
-        bail!("{} pictures, expected {}", answer.n_frames, args.n_frames);
+        bail!("{} images, expected {}", answer.n_frames, args.n_frames);
     }
     write(&model, &answer, &args.out)?;
     println!(
@@ -72,11 +73,11 @@ fn write(model: &Model, answer: &Answer, out: &Path) -> anyhow::Result<()> {
             Ok(camera) => camera,
             Err(fault) => bail!("frame {} has {fault}", frames.len()),
         };
-        let cam_from_map = camera.window_from_cam.inverse();
+        let cam_from_world = camera.window_from_cam.inverse();
         let matrix =
-            DMat4::from_rotation_translation(cam_from_map.rotation, cam_from_map.translation);
+            DMat4::from_rotation_translation(cam_from_world.rotation, cam_from_world.translation);
         frames.push(json!({
-            "cam_from_map": matrix.transpose().to_cols_array(),
+            "cam_from_world": matrix.transpose().to_cols_array(),
             "pose_enc": encoded,
             "fx": camera.fx,
             "fy": camera.fy,

@@ -12,16 +12,18 @@ use clap::{Parser, ValueEnum};
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::frame::RgbImage;
-use splat_mapper::gpu::device::Wanted;
-use splat_mapper::pose::Rigid;
-use splat_mapper::splat::cpu::CpuEngine;
-use splat_mapper::splat::mcmc::Copies;
-use splat_mapper::splat::wgpu::WgpuEngine;
-use splat_mapper::splat::{
-    Engine, McmcSettings, PoseStep, RefinerSettings, Splats, StepSettings, TrainingView,
-};
+
+use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::mcmc::Relocation;
+use splat_engine::settings::{McmcSettings, PoseMode, PoseNetworkSettings, StepSettings};
+use splat_engine::traits::Engine;
+use splat_engine::view::TrainingView;
+use splat_engine::wgpu::engine::WgpuEngine;
+use splat_gpu::device::Wanted;
+use splat_types::camera::Intrinsics;
+use splat_types::image::RgbImage;
+use splat_types::splats::splats::Splats;
+use splat_types::transform::Rigid;
 
 const N_VIEWS: usize = 8;
 const N_SPLATS: usize = 700;
@@ -58,23 +60,23 @@ fn main() -> anyhow::Result<()> {
             float_atomics: false,
         })?),
     };
-    set_up(&mut *engine);
+    set_up(&mut *engine)?;
     println!("{} steps on {}\n", args.steps, engine.adapter());
     println!("| step | loss | splats | RSS, MiB | GPU, MiB |");
     println!("|---|---|---|---|---|");
     let every = (args.steps / N_LOOKS).max(1);
     let mut first_mib = None;
     for n in 1..=args.steps {
-        engine.step((n as usize * 5) % N_VIEWS, &settings(n));
+        engine.step((n as usize * 5) % N_VIEWS, &settings(n))?;
         if n.is_multiple_of(MOVE_EVERY) {
             engine.relocate_and_grow(&McmcSettings {
                 min_opacity: 0.005,
-                copies: Copies::Picture,
+                copies: Relocation::Image,
                 max_splats: MAX_SPLATS,
                 growth: 1.05,
                 active_steps: 0,
                 seed: n as u32,
-            });
+            })?;
         }
         if !n.is_multiple_of(every) {
             continue;
@@ -93,17 +95,14 @@ fn main() -> anyhow::Result<()> {
 }
 
 fn report(engine: &mut dyn Engine, n: u64, mib: f64) -> anyhow::Result<()> {
-    if let Some(fault) = engine.fault() {
-        bail!("the engine has broken by step {n}: {fault}");
-    }
-    let loss = engine.take_stats().loss;
-    let splats = engine.splats();
+    let loss = engine.take_stats()?.loss;
+    let splats = engine.read()?;
     let broken = (0..splats.len()).filter(|i| !splats.is_finite(*i)).count();
-    let poses = engine.poses();
+    let poses = engine.poses()?;
     if broken > 0 || !loss.is_finite() || !poses.iter().all(Rigid::is_finite) {
         bail!("step {n}: loss {loss}, {broken} splats are not finite, poses {poses:?}");
     }
-    let gpu_mib = engine.peak_gpu_bytes() as f64 / (1024.0 * 1024.0);
+    let gpu_mib = engine.memory().peak_gpu_bytes as f64 / (1024.0 * 1024.0);
     println!(
         "| {n} | {loss:.5} | {} | {mib:.1} | {gpu_mib:.1} |",
         splats.len()
@@ -129,7 +128,7 @@ fn settings(n: u64) -> StepSettings {
         lr_sh_rest: 1.25e-4,
         lr_pose_rotation: 1e-4,
         lr_pose_translation: 1e-4,
-        lr_refiner: 1.5e-4,
+        lr_pose_network: 1.5e-4,
         lr_focal: 1e-5,
         lr_exposure: 1e-4,
         ssim_weight: 0.2,
@@ -140,13 +139,13 @@ fn settings(n: u64) -> StepSettings {
         sh_degree: 2,
         sh_interval: 1000,
         train_splats: true,
-        pose: PoseStep::Shared,
+        pose: PoseMode::Shared,
         ..StepSettings::default()
     }
 }
 
 /// A wall of splats with relief, photographed along an arc, disturbed.
-fn set_up(engine: &mut dyn Engine) {
+fn set_up(engine: &mut dyn Engine) -> anyhow::Result<()> {
     let mut rng = Pcg64Mcg::seed_from_u64(21);
     let mut splats = Splats {
         sh_degree: 2,
@@ -163,7 +162,7 @@ fn set_up(engine: &mut dyn Engine) {
         let color = (0..27).map(|k| rng.random_range(-1.5_f32..1.5) / (1.0 + k as f32));
         splats.sh.extend(color);
     }
-    engine.append(&splats);
+    engine.append(&splats)?;
     let intrinsics = Intrinsics {
         width_px: 72,
         height_px: 54,
@@ -176,7 +175,7 @@ fn set_up(engine: &mut dyn Engine) {
         let t = k as f64 / (N_VIEWS - 1) as f64 - 0.5;
         let place = DVec3::new(1.2 * t, 0.2 * (7.0 * t).sin(), 0.1 * t);
         let truth = Rigid::new(DQuat::from_rotation_y(-0.25 * t), place).inverse();
-        let rendering = engine.render(&intrinsics, &truth, 2);
+        let rendering = engine.render(&intrinsics, &truth, 2)?;
         let pixels = rendering.rgb.iter();
         let pixels = pixels.map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8);
         let mut three =
@@ -188,18 +187,19 @@ fn set_up(engine: &mut dyn Engine) {
                 pixels: pixels.collect(),
             }),
             intrinsics,
-            cam_from_map: Rigid::exp(three(), three()) * truth,
+            cam_from_world: Rigid::exp(three(), three()) * truth,
             depth: None,
             mask: None,
-        });
+        })?;
     }
     for mean in &mut splats.means {
         mean.iter_mut()
             .for_each(|v| *v += rng.random_range(-0.02..0.02));
     }
-    engine.overwrite(&splats);
-    engine.start_refiner(&RefinerSettings {
+    engine.replace(&splats)?;
+    engine.start_pose_network(&PoseNetworkSettings {
         seed: 1,
         camera_scale: 0.4,
-    });
+    })?;
+    Ok(())
 }

@@ -8,15 +8,18 @@ use std::time::Duration;
 
 use anyhow::{Result, anyhow, bail};
 use clap::Parser;
-use splat_mapper::clock::Stopwatch;
-use splat_mapper::publish::follow::{Followed, Follower};
-use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::ros::{self, standard::PoseWithCovarianceStamped};
-use splat_mapper::{clock::Stamp, export::ply, map::layout};
 use zenoh::qos::CongestionControl;
 use zenoh::query::ConsolidationMode;
 use zenoh::sample::Sample;
 use zenoh::{Config, Wait};
+
+use splat_mapper::node::save_map::{MapFile, save_map};
+use splat_msgs::client::follower::{Followed, Follower};
+use splat_msgs::ros;
+use splat_msgs::ros::standard::PoseWithCovarianceStamped;
+use splat_msgs::type_hash::dds_type_name;
+use splat_types::splats::layout;
+use splat_types::time::{Stamp, Stopwatch};
 
 /// Follows a running mapper over zenoh.
 #[derive(Parser)]
@@ -153,7 +156,7 @@ fn main() -> Result<()> {
                 held.poses.len()
             );
             if let Some(path) = &args.out {
-                ply::write(map, path)?;
+                save_map(MapFile::Ply(map), path)?;
             }
             if args.once {
                 return Ok(());

@@ -11,7 +11,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 # name, default, meaning
 ARGUMENTS = [
-    ("image", "/camera/image_raw", "topic with pictures; camera_info is taken from beside it"),
+    ("image", "/camera/image_raw", "topic with images; camera_info is taken from beside it"),
     ("namespace", "", "namespace of the node"),
     ("params", "", "parameter file over the shipped defaults; any subset of params.yaml"),
     ("out", "splat_mapper_out", "folder for the map and the report, written at the end"),
@@ -47,7 +47,7 @@ def generate_launch_description():
             {
                 "source.odometry_topic": ParameterValue(value("odometry"), value_type=str),
                 "publish.tf": ParameterValue(value("tf"), value_type=str),
-                "publish.folder": ParameterValue(value("folder"), value_type=str),
+                "publish.map_directory": ParameterValue(value("folder"), value_type=str),
                 "use_sim_time": flag("use_sim_time"),
                 "ros2.autostart": flag("autostart"),
             },

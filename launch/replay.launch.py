@@ -32,7 +32,7 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag", description="rosbag2 folder or MCAP file"),
-            DeclareLaunchArgument("image", default_value="/camera/image_raw", description="topic with pictures"),
+            DeclareLaunchArgument("image", default_value="/camera/image_raw", description="topic with images"),
             DeclareLaunchArgument("out", default_value="splat_mapper_out", description="folder for map and report"),
             DeclareLaunchArgument("rate", default_value="1.0", description="multiple of the recorded speed"),
             mapper,

@@ -50,9 +50,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--weights", required=True, help="file, folder, hub repository OWNER/NAME, or random")
     parser.add_argument(
-        "--height", type=side, required=True, help="picture height, a multiple of 14; fixed in the file"
+        "--height", type=side, required=True, help="image height, a multiple of 14; fixed in the file"
     )
-    parser.add_argument("--width", type=side, required=True, help="picture width, a multiple of 14; fixed in the file")
+    parser.add_argument("--width", type=side, required=True, help="image width, a multiple of 14; fixed in the file")
     parser.add_argument("--out", type=onnx_path, required=True, help="FILE.onnx; FILE.json is written beside it")
     parser.add_argument(
         "--precision", choices=("f32", "f16"), default="f32", help="of the body; in- and outputs are f32"
@@ -74,7 +74,7 @@ def arguments() -> argparse.Namespace:
 
 
 def side(text: str) -> int:
-    """A picture side: whole patches, at most what the position embeddings were trained near."""
+    """An image side: whole patches, at most what the position embeddings were trained near."""
     value = int(text)
     if value < PATCH or value % PATCH or value > 2016:
         nearest = min(max(PATCH, round(value / PATCH) * PATCH), 2016)

@@ -112,16 +112,16 @@ def decode(pose: np.ndarray, kind: str, height: int, width: int) -> tuple[np.nda
 
 def by_program(program: Path, model: Path, images: torch.Tensor) -> Answer:
     with tempfile.TemporaryDirectory() as folder:
-        pictures = Path(folder) / "images.f32"
-        images.numpy().astype("<f4").tofile(pictures)
-        command = [str(program), str(model), str(pictures), str(len(images)), folder]
+        image_file = Path(folder) / "images.f32"
+        images.numpy().astype("<f4").tofile(image_file)
+        command = [str(program), str(model), str(image_file), str(len(images)), folder]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         frames = json.loads((Path(folder) / "answer.json").read_text())["frames"]
         shape = (len(images), *images.shape[2:])
         depth, confidence = (
             np.fromfile(Path(folder) / name, "<f4").reshape(shape) for name in ("depth.f32", "conf.f32")
         )
-    cameras = np.array([frame["cam_from_map"] for frame in frames]).reshape(-1, 4, 4)
+    cameras = np.array([frame["cam_from_world"] for frame in frames]).reshape(-1, 4, 4)
     return Answer(cameras, np.array([[frame["fx"], frame["fy"]] for frame in frames]), depth, confidence)
 
 

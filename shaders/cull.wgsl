@@ -1,5 +1,5 @@
 // cull: splats and a camera -> one bit per splat that is visible, and how many of each 256.
-// First stage of a picture. One thread per splat. Equations: docs/GRADIENTS.md, projection.
+// First stage of an image. One thread per splat. Equations: docs/GRADIENTS.md, projection.
 
 #import step
 #import shape

@@ -11,10 +11,10 @@ const MIN_RELATIVE_RANGE: f32 = 1e-3;
 const LARGEST: f32 = 3.4e38;
 
 @group(0) @binding(0) var<uniform> step: Step;
-@group(0) @binding(1) var<storage, read> picture: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> depth_sum: array<f32>;
 @group(0) @binding(3) var<storage, read> wanted: array<u32>;
-@group(0) @binding(4) var<storage, read_write> v_picture: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> v_image: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> behind: array<f32>;
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
 
@@ -35,7 +35,7 @@ fn pixel_at(p: u32) -> Pixel {
     let given = depth_and_confidence(p % step.width_px, p / step.width_px);
     let depth = given.x;
     let confidence = given.y * unpack4x8unorm(wanted[p]).w;
-    let alpha = 1.0 - picture[p].w;
+    let alpha = 1.0 - image[p].w;
     if confidence <= 0.0 || alpha <= MIN_ALPHA_FOR_DEPTH {
         return Pixel(false, alpha, 0.0, 0.0);
     }
@@ -58,8 +58,8 @@ fn put(p: u32, pixel: Pixel, v: f32) {
         v_z = v / pixel.alpha;
         v_alpha = -v * pixel.rendered / pixel.alpha;
     }
-    v_picture[p].w += v_z;
-    behind[p] += depth_sum[p] * v_z - picture[p].w * v_alpha;
+    v_image[p].w += v_z;
+    behind[p] += depth_sum[p] * v_z - image[p].w * v_alpha;
 }
 
 @compute @workgroup_size(256)

@@ -1,4 +1,4 @@
-// move_share: splats that were drawn -> one of several at their place, with the opacity and scale that keep the picture.
+// move_share: splats that were drawn -> one of several at their place, with the opacity and scale that keep the image.
 // After move_draw. One thread per splat.
 
 #import step
@@ -53,7 +53,7 @@ fn held(opacity: f32) -> f32 {
     return min(max(opacity, moves.min_opacity), MAX_OPACITY);
 }
 
-// Sums over the picture of the alpha of n copies together, and of its square.
+// Sums over the image of the alpha of n copies together, and of its square.
 fn sums_of_copies(opacity: f32, n: u32) -> vec2<f32> {
     var all_alpha = 0.0;
     var first = 0.0;
@@ -69,7 +69,7 @@ fn sums_of_copies(opacity: f32, n: u32) -> vec2<f32> {
 }
 
 // Opacity of each of n copies, and the factor on the scale.
-fn shared_by_picture(opacity: f32, n: u32) -> vec2<f32> {
+fn shared_by_image(opacity: f32, n: u32) -> vec2<f32> {
     var low = 0.0;
     var high = root_of(opacity, n);
     for (var halving = 0u; halving < N_HALVINGS; halving += 1u) {
@@ -105,8 +105,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let at = 4u * splat_ix;
     let opacity = 1.0 / (1.0 + exp(-geometry[at].w));
     var copy = vec2<f32>(0.0);
-    if moves.by_picture == 1u {
-        copy = shared_by_picture(opacity, n);
+    if moves.by_image == 1u {
+        copy = shared_by_image(opacity, n);
     } else {
         copy = shared_by_line(opacity, n);
     }

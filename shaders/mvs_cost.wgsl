@@ -1,4 +1,4 @@
-// mvs_cost: reference and source pictures -> matching cost of each pixel on each plane, a byte each.
+// mvs_cost: reference and source images -> matching cost of each pixel on each plane, a byte each.
 // First stage of a sweep. One workgroup per tile of 32x16 pixels and word of four planes, one thread per column of 8
 // pixels. A cost is 1 - score: ZNCC over the window and likeness of the pixel itself, mean of the best two sources.
 
@@ -25,19 +25,19 @@ const PATCH_X: u32 = SWEEP_TILE_X + SWEEP_WINDOW - 1u;
 const PATCH_Y: u32 = SWEEP_TILE_Y + SWEEP_WINDOW - 1u;
 const N_PATCH: u32 = PATCH_X * PATCH_Y;
 
-// Source, warped, and reference. 0 outside of the reference picture: what lies there adds nothing to any sum.
+// Source, warped, and reference. 0 outside of the reference image: what lies there adds nothing to any sum.
 var<workgroup> patches: array<vec2<f32>, N_PATCH>;
 
 fn is_in_reference(at: vec2<i32>) -> bool {
     return at.x >= 0 && at.y >= 0 && at.x < i32(sweep.width_px) && at.y < i32(sweep.height_px);
 }
 
-// Pixel in the source; z says whether it lies in the picture.
+// Pixel in the source; z says whether it lies in the image.
 fn pixel_in_source(warp: Warp, start: vec3<f32>, at: vec2<i32>) -> vec3<f32> {
     let there = start + f32(at.y) * warp.step_y.xyz + f32(at.x) * warp.step_x.xyz;
     let pixel = there.xy * (1.0 / max(there.z, 1e-6));
     let last = vec2<f32>(f32(warp.width_px - 1u), f32(warp.height_px - 1u));
-    // Half a pixel beyond the outermost centres still belongs to the picture.
+    // Half a pixel beyond the outermost centres still belongs to the image.
     let is_inside = there.z > 1e-6 && all(pixel >= vec2<f32>(-0.5)) && all(pixel <= last + 0.5);
     return vec3<f32>(clamp(pixel, vec2<f32>(0.0), last), select(0.0, 1.0, is_inside));
 }
@@ -100,7 +100,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let last = vec2<i32>(i32(sweep.width_px), i32(sweep.height_px)) - 1;
 #repeat k 8
     var packed_$k = 0u;
-    // Pixels outside of the picture do as the nearest one, and keep nothing.
+    // Pixels outside of the image do as the nearest one, and keep nothing.
     let at_$k = min(own + vec2<i32>(0, $k), last);
     let window_$k = statistics[u32(at_$k.y) * sweep.width_px + u32(at_$k.x)];
 #end

@@ -12,13 +12,13 @@ const MIN_WEIGHT_SUM: f32 = 1e-6;
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> camera: Camera;
-@group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> depth_sum: array<f32>;
 // Photo as r, g, b, weight bytes; behind it depth and confidence as bits of f32, both 0 where there is none.
 @group(0) @binding(4) var<storage, read> wanted: array<u32>;
-@group(0) @binding(5) var<storage, read> blurred: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> maps: array<vec4<f32>>;
 // By r, g, b and the depth sum.
-@group(0) @binding(6) var<storage, read_write> v_picture: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> v_image: array<vec4<f32>>;
 // What lies behind the first splat, seen through the gradient, less the transmittance's part.
 @group(0) @binding(7) var<storage, read_write> behind: array<f32>;
 // Three per group: L1 and depth loss before their weights; gradient of log gain; gradient of offset.
@@ -48,42 +48,25 @@ fn depth_loss(x: u32, y: u32, alpha: f32, z: f32, weight: f32) -> Depth {
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let thread = flat(group, groups) * 64u + lane;
-    let x = thread % step.width_px;
-    let first = i32(thread / step.width_px * RUN);
+    let run = run_of_column(flat(group, groups) * 64u + lane);
+    let x = run.x;
+    let first = i32(run.y);
+    let start = x;
+    let stride = step.width_px;
+    let n_along = i32(step.height_px);
     let plane = step.width_px * step.height_px;
     let has_depth = (step.flags & FLAG_DEPTH) != 0u;
     let per_weight = 1.0 / max(3.0 * step.mask_sum, MIN_WEIGHT_SUM);
     var losses = vec4<f32>(0.0);
     var by_gain = vec3<f32>(0.0);
     var by_offset = vec3<f32>(0.0);
-#repeat t 14
-    var p_$t = vec3<f32>(0.0);
-    var q_$t = vec3<f32>(0.0);
-    var r_$t = vec3<f32>(0.0);
-    {
-        let y = first + $t - REACH;
-        if y >= 0 && y < i32(step.height_px) {
-            let at = u32(y) * step.width_px + x;
-            p_$t = blurred[at].xyz;
-            q_$t = blurred[plane + at].xyz;
-            r_$t = blurred[2u * plane + at].xyz;
-        }
-    }
-#end
+#import ssim_maps_load
 #repeat j 4
-    if first + $j < i32(step.height_px) {
-        var p = vec3<f32>(0.0);
-        var q = vec3<f32>(0.0);
-        var r = vec3<f32>(0.0);
-#repeat t 11
-        p += WINDOW[$t] * p_$[j+t];
-        q += WINDOW[$t] * q_$[j+t];
-        r += WINDOW[$t] * r_$[j+t];
-#end
+    if first + $j < n_along {
+#import ssim_maps_blur
         let y = u32(first + $j);
         let at = y * step.width_px + x;
-        let light = picture[at];
+        let light = image[at];
         let photo = unpack4x8unorm(wanted[at]);
         let seen = camera.gain.xyz * light.xyz;
         let compared = seen + camera.offset.xyz;
@@ -105,7 +88,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             v_z = depth.v_depth / alpha;
             v_alpha = -v_z * z;
         }
-        v_picture[at] = vec4<f32>(v_rgb, v_z);
+        v_image[at] = vec4<f32>(v_rgb, v_z);
         behind[at] = dot(light.xyz, v_rgb) + z_sum * v_z - light.w * v_alpha;
     }
 #end

@@ -1,4 +1,4 @@
-// project: visible splats -> ellipses on the picture with colour and depth, in order of their index.
+// project: visible splats -> ellipses on the image with colour and depth, in order of their index.
 // After cull. One thread per splat. Equations: docs/GRADIENTS.md, projection.
 
 #import step
@@ -6,7 +6,7 @@
 #import projected
 #import sh
 
-// A colour beyond this is a broken splat; its square would take SSIM, and with it the whole picture, to infinity.
+// A colour beyond this is a broken splat; its square would take SSIM, and with it the whole image, to infinity.
 const MAX_COLOR: f32 = 1e4;
 
 @group(0) @binding(0) var<uniform> step: Step;

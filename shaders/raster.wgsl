@@ -12,7 +12,7 @@
 @group(0) @binding(2) var<storage, read> instances: array<u32>;
 @group(0) @binding(3) var<storage, read> tile_ranges: array<vec2<u32>>;
 // r, g, b, transmittance.
-@group(0) @binding(4) var<storage, read_write> picture: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> image: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> depth_sum: array<f32>;
 // Splats looked at before the whole tile had stopped; the host clears them.
 @group(0) @binding(6) var<storage, read_write> n_used: array<atomic<u32>>;
@@ -28,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let size_px = vec2<f32>(f32(step.width_px), f32(step.height_px));
     let range = tile_ranges[tile];
 #repeat i PIXELS
-    // Negative once the pixel has stopped; off the picture it has from the start.
+    // Negative once the pixel has stopped; off the image it has from the start.
     var t_$i = select(-1.0, 1.0, all(corner + pixel_in_tile($iu, lane) < size_px));
     var light_$i = vec4<f32>(0.0);
 #end
@@ -63,7 +63,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let at = first + vec2<u32>(pixel_in_tile($iu, lane));
         if at.x < step.width_px && at.y < step.height_px {
             let pixel = at.y * step.width_px + at.x;
-            picture[pixel] = vec4<f32>(light_$i.xyz, abs(t_$i));
+            image[pixel] = vec4<f32>(light_$i.xyz, abs(t_$i));
             depth_sum[pixel] = light_$i.w;
         }
     }

@@ -1,7 +1,7 @@
 // scan_apply: numbers and the sums before their blocks -> the sum before each number, and the total behind the last.
 // After scan_blocks. One workgroup per block.
 
-#import step
+#import flat
 #import scanning
 
 @group(0) @binding(0) var<storage, read> numbers: array<u32>;

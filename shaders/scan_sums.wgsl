@@ -1,7 +1,7 @@
 // scan_sums: numbers -> the sum of each block of 2,048.
 // First stage of a prefix sum. One workgroup per block.
 
-#import step
+#import flat
 #import scanning
 
 @group(0) @binding(0) var<storage, read> numbers: array<u32>;

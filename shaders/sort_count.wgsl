@@ -1,7 +1,7 @@
 // sort_count: keys -> how many of each digit there are in each block of 2,048.
 // First stage of a pass of the radix sort; a scan of the table follows. One workgroup per block.
 
-#import step
+#import flat
 #import sorting
 
 @group(0) @binding(0) var<uniform> sort_pass: SortPass;

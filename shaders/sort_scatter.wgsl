@@ -1,7 +1,7 @@
 // sort_scatter: keys with values -> the same in order of one digit, equal digits as they were.
 // After the scan of sort_count's table. One workgroup per block.
 
-#import step
+#import flat
 #import sorting
 
 @group(0) @binding(0) var<uniform> sort_pass: SortPass;

@@ -7,7 +7,7 @@
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> camera: Camera;
-@group(0) @binding(2) var<storage, read> picture: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
 // Photo as r, g, b, weight bytes; depth behind it.
 @group(0) @binding(3) var<storage, read> wanted: array<u32>;
 // Four planes: mean of x with xy.r in w, mean of y with xy.g, x^2 with xy.b, y^2.
@@ -15,21 +15,19 @@
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let runs = (step.width_px + RUN - 1u) / RUN;
-    let run = flat(group, groups) * 64u + lane;
-    let y = run / runs;
-    if y >= step.height_px {
+    let run = run_of_row(flat(group, groups) * 64u + lane);
+    if run.y >= step.height_px {
         return;
     }
-    let first = i32(run % runs * RUN);
-    let row = i32(y * step.width_px);
+    let first = i32(run.x);
+    let row = i32(run.y * step.width_px);
 #repeat t 14
     var x_$t = vec3<f32>(0.0);
     var y_$t = vec3<f32>(0.0);
     {
         let at = first + $t - REACH;
         if at >= 0 && at < i32(step.width_px) {
-            x_$t = camera.gain.xyz * picture[row + at].xyz + camera.offset.xyz;
+            x_$t = camera.gain.xyz * image[row + at].xyz + camera.offset.xyz;
             y_$t = unpack4x8unorm(wanted[row + at]).xyz;
         }
     }

@@ -16,9 +16,9 @@ var<workgroup> sums: array<f32, 64>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let thread = flat(group, groups) * 64u + lane;
-    let x = thread % step.width_px;
-    let first = i32(thread / step.width_px * RUN);
+    let run = run_of_column(flat(group, groups) * 64u + lane);
+    let x = run.x;
+    let first = i32(run.y);
     let plane = step.width_px * step.height_px;
     var sum = 0.0;
 #repeat t 14

@@ -1,12 +1,12 @@
 // update_view: sums over splats and pixels -> the view's pose and exposure, the shared network and the focal factor after
 // one update, and the statistics of the step.
-// Last stage of a step. One workgroup of 64 threads. Equations: docs/GRADIENTS.md, pose, refiner and Adam.
+// Last stage of a step. One workgroup of 64 threads. Equations: docs/GRADIENTS.md, pose, pose network and Adam.
 
 #import step
 #import camera
 #import quat
 #import adam
-#import refiner
+#import pose_network
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> camera: Camera;
@@ -21,7 +21,7 @@
 // Share of itself, times the rate, that each number of the exposure loses in an update: without it, all views and all
 // splats could grow brighter together.
 const EXPOSURE_PULL: f32 = 0.1;
-// Twentyfold, and the whole range of colour: beyond is no exposure but a broken picture.
+// Twentyfold, and the whole range of colour: beyond is no exposure but a broken image.
 const MAX_GAIN: f32 = 3.0;
 const MAX_OFFSET: f32 = 1.0;
 const STATS_GRADIENTS: u32 = 8u;
@@ -83,7 +83,7 @@ fn note_stats() {
     }
 }
 
-// exp([rho; theta]) cam_from_map, with Adam on (rho, theta).
+// exp([rho; theta]) cam_from_world, with Adam on (rho, theta).
 fn move_directly(record: u32) {
     let age = u32(views[record + VIEW_POSE_AGE]) + 1u;
     views[record + VIEW_POSE_AGE] = f32(age);
@@ -100,7 +100,7 @@ fn move_directly(record: u32) {
     }
     var rho = vec3<f32>(delta[0], delta[1], delta[2]);
     var theta = vec3<f32>(delta[3], delta[4], delta[5]);
-    if (step.flags & FLAG_REFINER) != 0u {
+    if (step.flags & FLAG_POSE_NETWORK) != 0u {
         // The record holds the pose before the network: the same increment seen from there.
         let motion = transpose(orthonormal(increment_rows()));
         let shift = step.camera_scale * vec3<f32>(output[0], output[1], output[2]);
@@ -159,7 +159,7 @@ fn update_focal() {
 fn differentiate_increment() {
     let a = increment_rows();
     let b = orthonormal(a);
-    // Of the increment on the right of map_from_cam: the negative of the one on the left of cam_from_map.
+    // Of the increment on the right of world_from_cam: the negative of the one on the left of cam_from_world.
     let e_r = -totals[0].xyz;
     let e_t = -totals[1].xyz;
     let rotation = transpose(b);
@@ -185,7 +185,7 @@ fn update_parameter(at: u32, g: f32, correction: vec2<f32>) {
     let v = BETA_2 * network[2u * NET_SIZE + at] + (1.0 - BETA_2) * g * g;
     network[NET_SIZE + at] = m;
     network[2u * NET_SIZE + at] = v;
-    network[at] -= step.lr_refiner * adam_direction(m, v, correction, VIEW_EPS);
+    network[at] -= step.lr_pose_network * adam_direction(m, v, correction, VIEW_EPS);
 }
 
 fn update_network(record: u32, lane: u32) {
@@ -231,7 +231,7 @@ fn update_network(record: u32, lane: u32) {
     let v = BETA_2 * views[record + VIEW_EMBEDDING_V + lane] + (1.0 - BETA_2) * g_embedding * g_embedding;
     views[record + VIEW_EMBEDDING_M + lane] = m;
     views[record + VIEW_EMBEDDING_V + lane] = v;
-    views[record + VIEW_EMBEDDING + lane] -= step.lr_refiner * adam_direction(m, v, corrections(embedding_age), VIEW_EPS);
+    views[record + VIEW_EMBEDDING + lane] -= step.lr_pose_network * adam_direction(m, v, corrections(embedding_age), VIEW_EPS);
     if lane == 0u {
         network[NET_AGE] = f32(age);
         views[record + VIEW_EMBEDDING_AGE] = f32(embedding_age);
@@ -267,7 +267,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
             update_focal();
         }
     }
-    if (step.flags & FLAG_POSE_SHARED) != 0u && (step.flags & FLAG_REFINER) != 0u {
+    if (step.flags & FLAG_POSE_SHARED) != 0u && (step.flags & FLAG_POSE_NETWORK) != 0u {
         update_network(record, lane);
     }
 }

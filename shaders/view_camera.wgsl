@@ -1,10 +1,10 @@
 // view_camera: a view's pose, focal factor, exposure and the shared network -> the camera of a step.
-// First stage of a step. One workgroup. Equations: docs/GRADIENTS.md, refiner.
+// First stage of a step. One workgroup. Equations: docs/GRADIENTS.md, pose network.
 
 #import step
 #import camera
 #import quat
-#import refiner
+#import pose_network
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read_write> views: array<f32>;
@@ -22,8 +22,8 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     var rotation = rotation_of(normalize(vec4<f32>(views[q], views[q + 1u], views[q + 2u], views[q + 3u])));
     let t = record + VIEW_TRANSLATION;
     var translation = vec3<f32>(views[t], views[t + 1u], views[t + 2u]);
-    if (step.flags & FLAG_REFINER) != 0u {
-        // map_from_cam' = map_from_cam [R_d | scale dx], so that cam_from_map' = R_d' (cam_from_map - scale dx).
+    if (step.flags & FLAG_POSE_NETWORK) != 0u {
+        // world_from_cam' = world_from_cam [R_d | scale dx], so that cam_from_world' = R_d' (cam_from_world - scale dx).
         let rows = orthonormal(increment_rows());
         let shift = step.camera_scale * vec3<f32>(output[0], output[1], output[2]);
         rotation = rows * rotation;
@@ -33,7 +33,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let p = record + VIEW_PINHOLE;
     let focal = exp(network[LOG_FOCAL]) * vec2<f32>(views[p], views[p + 1u]);
     let principal = vec2<f32>(views[p + 2u], views[p + 3u]);
-    // 0.3 of half the picture's slope beyond its edges, as gsplat does.
+    // 0.3 of half the image's slope beyond its edges, as gsplat does.
     let beyond = 0.3 * 0.5 * size_px / focal;
     camera.rotation_x = vec4<f32>(rotation[0], 0.0);
     camera.rotation_y = vec4<f32>(rotation[1], 0.0);

@@ -1,50 +1,17 @@
 //! splat-mapper: camera frames in, refined poses and a 3D Gaussian splat map out.
 //!
-//! Modules stand in layer order, which is the order in which data flows: a module uses only
-//! modules above it (`tests/it/layers.rs` checks). One direction:
-//! `Frame -> Batch -> GeometryBatch -> SplatMap -> Arc<Snapshot> -> publishers`.
-
-pub mod clock;
-
-pub mod config;
-
-pub mod pose;
-
-pub mod camera;
-
-pub mod queue;
-
-pub mod atomic;
-
-pub mod frame;
-
-pub mod libraries;
-
-pub mod memory;
-
-pub mod onnx;
-
-pub mod ros;
-
-pub mod source;
-
-pub mod select;
-
-pub mod gpu;
-
-pub mod geometry;
-
-pub mod track;
-
-pub mod splat;
-
-pub mod map;
-
-pub mod publish;
-
-pub mod export;
+//! The node: threads, queues, files and the command line around the crates below `crates/`. Modules stand in layer order:
+//! a module uses only modules above it.
 
 pub mod eval;
+
+pub mod machine;
+
+pub mod doctor;
+
+pub mod report;
+
+pub mod params;
 
 pub mod node;
 

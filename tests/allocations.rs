@@ -7,12 +7,16 @@ use std::cell::Cell;
 use std::time::Duration;
 
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
-use splat_mapper::clock::Stamp;
-use splat_mapper::config::{Settings, SourceParams};
-use splat_mapper::source::Source;
-use splat_mapper::source::camera::stamps::ClockReading;
-use splat_mapper::source::camera::{Camera, CameraError, CameraSource, Coding, Layout, Shot};
-use splat_mapper::source::pixels::{PixelFormat, YuvColour};
+
+use splat_image::pixel_format::{PixelFormat, YuvColour};
+use splat_io::camera::driver::{Camera, CapturedImage, Coding, Layout};
+use splat_io::camera::source::CameraSource;
+use splat_io::camera::stamps::ClockReading;
+use splat_io::camera_error::CameraError;
+use splat_io::frame_source::Source;
+use splat_io::params::SourceParams;
+use splat_mapper::params::settings::Settings;
+use splat_types::time::Stamp;
 
 const WIDTH_PX: u32 = 640;
 const HEIGHT_PX: u32 = 480;
@@ -65,10 +69,10 @@ impl Camera for Endless {
         self.layout
     }
 
-    fn next(&mut self, _wait: Duration) -> Result<Option<Shot<'_>>, CameraError> {
+    fn next(&mut self, _wait: Duration) -> Result<Option<CapturedImage<'_>>, CameraError> {
         self.n += 1;
         let now = self.read_clocks();
-        Ok(Some(Shot {
+        Ok(Some(CapturedImage {
             bytes: &self.bytes,
             sequence: Some(self.n),
             taken_nanos: Some(now.after_nanos),
@@ -137,7 +141,7 @@ fn per_hundred_frames(mut source: CameraSource) -> u64 {
 }
 
 #[test]
-fn raw_pictures_become_undistorted_frames_without_an_allocation() {
+fn raw_images_become_undistorted_frames_without_an_allocation() {
     for (format, n_bytes) in [
         (PixelFormat::Yuyv, 2 * WIDTH_PX * HEIGHT_PX),
         (PixelFormat::Nv12, 3 * WIDTH_PX * HEIGHT_PX / 2),
@@ -151,7 +155,7 @@ fn raw_pictures_become_undistorted_frames_without_an_allocation() {
 }
 
 #[test]
-fn jpeg_pictures_become_undistorted_frames_without_an_allocation() {
+fn jpeg_images_become_undistorted_frames_without_an_allocation() {
     let pixels: Vec<u8> = (0..3 * WIDTH_PX * HEIGHT_PX)
         .map(|ix| (ix % 253) as u8)
         .collect();

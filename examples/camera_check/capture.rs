@@ -1,21 +1,23 @@
-//! Pictures of every format: their number, size, order, time and colours.
+//! Images of every format: their number, size, order, time and colours.
 
 use std::path::Path;
 
 use anyhow::{Context, ensure};
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::{Settings, SourceParams};
-use splat_mapper::eval::doctor;
-use splat_mapper::frame::RgbImage;
-use splat_mapper::source::camera::live::Live;
-use splat_mapper::source::camera::{Coding, Layout, decode};
-use splat_mapper::source::decode::empty;
-use splat_mapper::source::jpeg::Jpeg;
-use splat_mapper::source::pixels::PixelFormat;
-use splat_mapper::source::v4l2;
 
-/// Pictures taken in each format.
-const N_PICTURES: usize = 12;
+use splat_image::jpeg::decoder::Jpeg;
+use splat_image::limits::empty;
+use splat_image::pixel_format::PixelFormat;
+use splat_io::camera::driver::{Coding, Layout, decode};
+use splat_io::camera::live::Live;
+use splat_io::params::SourceParams;
+use splat_io::v4l2;
+use splat_mapper::doctor::checks;
+use splat_mapper::params::settings::Settings;
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
+
+/// Images taken in each format.
+const N_IMAGES: usize = 12;
 /// A machine that is emulated beside other work may run late by so much.
 const MAX_RATE_ERROR: f64 = 0.25;
 /// Grey levels between a bar and what it must be: YUV has 8 bits and half the columns.
@@ -32,7 +34,7 @@ const BARS: [[u8; 3]; 8] = [
     [0, 0, 0],
 ];
 
-/// A picture as it came.
+/// An image as it came.
 pub(crate) struct Taken {
     pub layout: Layout,
     pub stamp: Stamp,
@@ -49,7 +51,7 @@ pub(crate) fn params(settings: &[&str]) -> anyhow::Result<SourceParams> {
 }
 
 pub(crate) fn open(device: &Path, settings: &[&str]) -> anyhow::Result<Live> {
-    let opener = v4l2::opener(device, &params(settings)?);
+    let opener = v4l2::camera::opener(device, &params(settings)?);
     Ok(Live::open(device.display().to_string(), opener)?)
 }
 
@@ -64,9 +66,9 @@ pub(crate) fn take(live: &mut Live) -> anyhow::Result<Taken> {
 }
 
 pub(crate) fn listing(device: &Path, is_vivid: bool) -> anyhow::Result<()> {
-    let checks = doctor::doctor();
+    let checks = checks::doctor();
     let camera: Vec<_> = checks.into_iter().filter(|c| c.name == "camera").collect();
-    println!("{}", doctor::format_checks(&camera));
+    println!("{}", checks::format_checks(&camera));
     let cameras = v4l2::list::list();
     let found = cameras.into_iter().find(|(path, _)| path == device);
     let found = found.context("the camera is not listed")?.1?;
@@ -98,29 +100,29 @@ pub(crate) fn each_format(device: &Path, is_vivid: bool) -> anyhow::Result<()> {
     for name in names {
         let wanted = format!("source.camera.formats={name}");
         open(device, &[&wanted, "source.camera.rate=15"])
-            .and_then(|live| check_pictures(live, name, is_vivid))
+            .and_then(|live| check_images(live, name, is_vivid))
             .with_context(|| name.to_owned())?;
     }
     Ok(())
 }
 
-/// Pictures are of the right number, size, order and age, and differ.
-pub(crate) fn check_pictures(mut live: Live, name: &str, is_vivid: bool) -> anyhow::Result<()> {
+/// Images are of the right number, size, order and age, and differ.
+pub(crate) fn check_images(mut live: Live, name: &str, is_vivid: bool) -> anyhow::Result<()> {
     let layout = live.layout();
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     let mut jpeg = Jpeg::default();
-    let mut picture = empty();
+    let mut image = empty();
     let mut decode_ms = Vec::new();
     let started = Stamp::now();
-    for _ in 0..N_PICTURES {
+    for _ in 0..N_IMAGES {
         let taken = take(&mut live)?;
         let watch = Stopwatch::start();
-        decode(&taken.layout, &taken.bytes, &mut jpeg, &mut picture)?;
+        decode(&taken.layout, &taken.bytes, &mut jpeg, &mut image)?;
         decode_ms.push(watch.secs() * 1e3);
-        pictures.push(taken);
+        images.push(taken);
     }
-    let hashes: Vec<u64> = pictures.iter().map(|p| hash(&p.bytes)).collect();
-    for (taken, hash) in pictures.iter().zip(&hashes) {
+    let hashes: Vec<u64> = images.iter().map(|p| hash(&p.bytes)).collect();
+    for (taken, hash) in images.iter().zip(&hashes) {
         let (stamp, late) = (taken.stamp, taken.arrived.secs_since(taken.stamp) * 1e3);
         println!(
             "  {name} {stamp} {hash:016x} {} bytes, {late:.1} ms old",
@@ -131,25 +133,25 @@ pub(crate) fn check_pictures(mut live: Live, name: &str, is_vivid: bool) -> anyh
     let missed = live.take_tally().missed;
     println!(
         "  {name} {layout:?}: {missed} missed, decoded in {:.2} ms",
-        decode_ms[N_PICTURES / 2]
+        decode_ms[N_IMAGES / 2]
     );
     if let Coding::Raw(format, _) = layout.coding {
         let step = layout.step.max(format.row_bytes(layout.width_px));
         let n_bytes = (step * format.n_rows(layout.height_px)) as usize;
         ensure!(
-            pictures.iter().all(|p| p.bytes.len() == n_bytes),
+            images.iter().all(|p| p.bytes.len() == n_bytes),
             "sizes are not {n_bytes}"
         );
     }
     ensure!(
-        pictures.windows(2).all(|p| p[0].stamp < p[1].stamp),
+        images.windows(2).all(|p| p[0].stamp < p[1].stamp),
         "stamps do not increase"
     );
     ensure!(
-        pictures.iter().all(|p| p.stamp <= p.arrived),
+        images.iter().all(|p| p.stamp <= p.arrived),
         "a stamp lies in the future"
     );
-    let oldest = started.secs_since(pictures[0].stamp);
+    let oldest = started.secs_since(images[0].stamp);
     ensure!(
         oldest < 1.0,
         "the first stamp is {oldest} s before the start"
@@ -158,11 +160,11 @@ pub(crate) fn check_pictures(mut live: Live, name: &str, is_vivid: bool) -> anyh
         .iter()
         .collect::<std::collections::BTreeSet<_>>()
         .len();
-    ensure!(n_distinct == N_PICTURES, "{n_distinct} distinct pictures");
+    ensure!(n_distinct == N_IMAGES, "{n_distinct} distinct images");
     if let Some(rate) = layout.rate_hz {
         // Missed ones took their time too.
-        let secs = pictures[N_PICTURES - 1].stamp.secs_since(pictures[0].stamp);
-        let found = (N_PICTURES as f64 - 1.0 + missed as f64) / secs;
+        let secs = images[N_IMAGES - 1].stamp.secs_since(images[0].stamp);
+        let found = (N_IMAGES as f64 - 1.0 + missed as f64) / secs;
         ensure!(
             (found / rate - 1.0).abs() < MAX_RATE_ERROR,
             "{found} Hz, expected {rate}"
@@ -173,19 +175,19 @@ pub(crate) fn check_pictures(mut live: Live, name: &str, is_vivid: bool) -> anyh
             (layout.width_px, layout.height_px) == (640, 480),
             "{layout:?}"
         );
-        check_bars(&picture, &layout)?;
+        check_bars(&image, &layout)?;
     }
     Ok(())
 }
 
-/// The colour bars, low in the picture where no text lies over them.
-pub(crate) fn check_bars(picture: &RgbImage, layout: &Layout) -> anyhow::Result<()> {
+/// The colour bars, low in the image where no text lies above them.
+pub(crate) fn check_bars(image: &RgbImage, layout: &Layout) -> anyhow::Result<()> {
     let is_grey = matches!(layout.coding, Coding::Raw(PixelFormat::Grey, _));
-    let (width, height) = (picture.width_px as usize, picture.height_px as usize);
+    let (width, height) = (image.width_px as usize, image.height_px as usize);
     let seen = |ix: usize| {
         let (x, y) = ((2 * ix + 1) * width / 16, height * 3 / 4);
         let at = (y * width + x) * 3;
-        [0, 1, 2].map(|channel| picture.pixels[at + channel])
+        [0, 1, 2].map(|channel| image.pixels[at + channel])
     };
     for (ix, bar) in BARS.iter().enumerate() {
         let found = seen(ix);

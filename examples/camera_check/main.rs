@@ -27,7 +27,7 @@ fn main() -> std::process::ExitCode {
     let device = PathBuf::from(device.unwrap_or_else(|| "/dev/video0".to_owned()));
     let mut checks: Vec<(&str, Check)> = vec![
         ("cameras are listed with what they offer", capture::listing),
-        ("each format gives its pictures", capture::each_format),
+        ("each format gives its images", capture::each_format),
     ];
     if is_vivid {
         checks.extend(faults::ALL);
@@ -37,7 +37,7 @@ fn main() -> std::process::ExitCode {
     }
     let mut n_failed = 0;
     for (name, check) in checks {
-        let watch = splat_mapper::clock::Stopwatch::start();
+        let watch = splat_types::time::Stopwatch::start();
         println!("CHECK {name}");
         let verdict = match check(&device, is_vivid) {
             Ok(()) => "ok".to_owned(),

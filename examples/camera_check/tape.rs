@@ -4,18 +4,19 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
-use splat_mapper::config::Settings;
-use splat_mapper::source::camera::{Coding, Layout};
-use splat_mapper::source::pixels::{PixelFormat, YuvColour};
-use splat_mapper::source::recording::{Wanted, record};
-use splat_mapper::source::{self, Source};
 
 use crate::Check;
 use crate::capture::{check_bars, hash, params};
+use splat_image::pixel_format::{PixelFormat, YuvColour};
+use splat_io::camera::driver::{Coding, Layout};
+use splat_io::frame_source::Source;
+use splat_io::recording::{Wanted, record};
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
 
 pub(crate) const ALL: [(&str, Check); 2] = [
     (
-        "a recording has every picture, its stamp and the calibration",
+        "a recording has every image, its stamp and the calibration",
         recorded,
     ),
     ("a live source gives frames until it is asked to end", live),
@@ -37,23 +38,17 @@ fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
     std::fs::write(&yaml, CALIBRATION)?;
     let url = format!("source.camera_info_url=file://{}", yaml.display());
     let wanted = Wanted {
-        source: format!("v4l2:{}", device.display()),
         out: bag.clone(),
         duration_secs: Some(3.0),
-        seed: 0,
     };
     let settings = Settings::shipped().params()?;
     let from = params(&[&url, "source.camera.rate=15"])?;
-    let done = record(
-        &wanted,
-        &from,
-        &settings.record,
-        &Arc::default(),
-        &mut |_| {},
-    )?;
+    let (uri, asked) = (format!("v4l2:{}", device.display()), Arc::default());
+    let input = open_source::open_input(&uri, &from, 0, wanted.duration_secs, &asked)?;
+    let done = record(input, &wanted, &settings.record, &asked, &mut |_| {})?;
     println!("  {done:?}");
-    ensure!(done.n_pictures + done.n_dropped >= 30, "{done:?}");
-    let mut replay = source::open(&format!("mcap:{}", bag.display()), &params(&[])?, 0)?;
+    ensure!(done.n_images + done.n_dropped >= 30, "{done:?}");
+    let mut replay = open_source::open(&format!("mcap:{}", bag.display()), &params(&[])?, 0)?;
     let mut last = None;
     let mut n_frames = 0;
     while let Some(frame) = replay.next() {
@@ -77,9 +72,9 @@ fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
         }
     }
     ensure!(
-        n_frames == done.n_pictures,
+        n_frames == done.n_images,
         "{n_frames} frames of {}",
-        done.n_pictures
+        done.n_images
     );
     ensure!(replay.counts().fault.is_none(), "{:?}", replay.counts());
     let size = std::fs::metadata(&bag)?.len();
@@ -89,7 +84,7 @@ fn recorded(device: &Path, _: bool) -> anyhow::Result<()> {
 
 fn live(device: &Path, _: bool) -> anyhow::Result<()> {
     let uri = format!("v4l2:{}", device.display());
-    let mut camera = source::open(&uri, &params(&["source.max_frames=10"])?, 0)?;
+    let mut camera = open_source::open(&uri, &params(&["source.max_frames=10"])?, 0)?;
     ensure!(camera.is_live());
     let mut seqs = Vec::new();
     while let Some(frame) = camera.next() {
@@ -114,5 +109,5 @@ fn live(device: &Path, _: bool) -> anyhow::Result<()> {
 
 fn reopened(camera: Box<dyn Source>, uri: &str) -> anyhow::Result<Box<dyn Source>> {
     drop(camera);
-    Ok(source::open(uri, &params(&[])?, 0)?)
+    Ok(open_source::open(uri, &params(&[])?, 0)?)
 }

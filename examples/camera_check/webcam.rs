@@ -3,18 +3,19 @@
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
-use splat_mapper::source::camera::live::Live;
-use splat_mapper::source::{v4l2, webcam};
 
 use crate::Check;
-use crate::capture::{check_pictures, params};
+use crate::capture::{check_images, params};
 use crate::faults::unplugged;
+use splat_io::camera::live::Live;
+use splat_io::v4l2;
+use splat_io::webcam;
 
-/// nokhwa 0.1.4 for Linux does not know the kernel's name of grey pictures.
+/// nokhwa 0.1.4 for Linux does not know the kernel's name of grey images.
 const FORMATS: [&str; 4] = ["yuyv", "nv12", "rgb24", "bgr24"];
 
 pub(crate) const ALL: [(&str, Check); 3] = [
-    ("a webcam gives its pictures in each format", each_format),
+    ("a webcam gives its images in each format", each_format),
     ("an unplugged webcam is said and comes back", unplug),
     ("a webcam that is not there says so", no_webcam),
 ];
@@ -29,7 +30,7 @@ fn each_format(_: &Path, is_vivid: bool) -> anyhow::Result<()> {
     for name in FORMATS {
         let wanted = format!("source.camera.formats={name}");
         open("0", &[&wanted, "source.camera.rate=15"])
-            .and_then(|live| check_pictures(live, name, is_vivid))
+            .and_then(|live| check_images(live, name, is_vivid))
             .with_context(|| name.to_owned())?;
     }
     Ok(())

@@ -1,6 +1,6 @@
 """The authors' network -> a module that PyTorch can trace into ONNX, same numbers.
 
-Each patch replaces one method of the loaded network by our own code, for one picture size. What it
+Each patch replaces one method of the loaded network by our own code, for one image size. What it
 replaces and why is said at each; nothing of the authors' source is repeated here.
 """
 

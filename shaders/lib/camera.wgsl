@@ -1,11 +1,11 @@
-// A pinhole at a pose, and how the picture is compared. Written by `camera` or by the host. Mirrored by gpu/types.rs.
+// A pinhole at a pose, and how the image is compared. Written by `camera` or by the host. Mirrored by splat/wgpu/types.rs.
 
 struct Camera {
-    // Columns of the rotation of cam_from_map; w unused.
+    // Columns of the rotation of cam_from_world; w unused.
     rotation_x: vec4<f32>,
     rotation_y: vec4<f32>,
     rotation_z: vec4<f32>,
-    // Translation of cam_from_map; w unused.
+    // Translation of cam_from_world; w unused.
     translation: vec4<f32>,
     // Of the camera in the map; w unused.
     center: vec4<f32>,
@@ -21,7 +21,7 @@ struct Camera {
     // 1 once a step needed more instances than there is room for; steps do nothing until the host has grown it.
     is_full: u32,
     n_wanted: u32,
-    // Pictures since the host last looked that had room.
+    // Images since the host last looked that had room.
     n_done: u32,
     padding_0: u32,
     padding_1: u32,

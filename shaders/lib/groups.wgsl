@@ -1,4 +1,4 @@
-// Indirect dispatches of a step: x, y, z of each, four words apart. Mirrored by gpu/types.rs.
+// Indirect dispatches of a step: x, y, z of each, four words apart. Mirrored by splat/wgpu/types.rs.
 
 const ARGS_VISIBLE: u32 = 0u;
 const ARGS_SORT_VISIBLE: u32 = 4u;

@@ -1,4 +1,4 @@
-// One pass of MCMC moves (Kheradmand et al. 2024): what the host says of it. Mirrored by gpu/types.rs.
+// One pass of MCMC moves (Kheradmand et al. 2024): what the host says of it. Mirrored by splat/wgpu/types.rs.
 // The arithmetic is that of src/splat/mcmc.rs.
 
 struct Moves {
@@ -13,8 +13,8 @@ struct Moves {
     n_steps: u32,
     sh_stored: u32,
     min_opacity: f32,
-    // What copies keep: 1 the sums over the picture, 0 what a line gathers.
-    by_picture: u32,
+    // What copies keep: 1 the sums over the image, 0 what a line gathers.
+    by_image: u32,
     padding_0: u32,
     padding_1: u32,
 }

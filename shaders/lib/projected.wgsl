@@ -1,4 +1,4 @@
-// One visible splat on the picture. Mirrored by gpu/types.rs.
+// One visible splat on the image. Mirrored by splat/wgpu/types.rs.
 
 struct Projected {
     center_px: vec2<f32>,

@@ -1,4 +1,4 @@
-// What one pass over a picture has to know; the host fills it. Mirrored by gpu/types.rs.
+// What one pass over an image has to know; the host fills it. Mirrored by splat/wgpu/types.rs.
 
 #import flat
 
@@ -28,7 +28,7 @@ struct Step {
     lr_sh_rest: f32,
     lr_rotation: f32,
     lr_translation: f32,
-    lr_refiner: f32,
+    lr_pose_network: f32,
     lr_focal: f32,
     lr_exposure: f32,
     noise: f32,
@@ -56,7 +56,7 @@ const FLAG_GRADIENTS: u32 = 2u;
 const FLAG_POSE_DIRECT: u32 = 4u;
 const FLAG_POSE_SHARED: u32 = 8u;
 const FLAG_DEPTH: u32 = 16u;
-const FLAG_REFINER: u32 = 32u;
+const FLAG_POSE_NETWORK: u32 = 32u;
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

@@ -1,5 +1,5 @@
 // Plane sweep and semi-global matching: what one sweep has to know, and how costs lie in memory. Mirrored by
-// gpu/types.rs. The constants come from the host, which matches with the same ones on the CPU (geometry/mvs).
+// geometry/mvs/gpu_types.rs. The constants come from the host, which matches with the same ones on the CPU (geometry/mvs).
 
 #import flat
 

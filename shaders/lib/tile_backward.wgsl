@@ -13,7 +13,7 @@
 @group(0) @binding(3) var<storage, read> tile_ranges: array<vec2<u32>>;
 @group(0) @binding(4) var<storage, read> n_used: array<u32>;
 // By r, g, b and the depth sum.
-@group(0) @binding(5) var<storage, read> v_picture: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> v_image: array<vec4<f32>>;
 // What lies behind the first splat, seen through the gradient, less the transmittance's part.
 @group(0) @binding(6) var<storage, read> behind_all: array<f32>;
 
@@ -36,7 +36,7 @@ fn walk_back(tile: u32, lane: u32) {
         if at.x < step.width_px && at.y < step.height_px {
             let pixel = at.y * step.width_px + at.x;
             t_$i = 1.0;
-            v_$i = v_picture[pixel];
+            v_$i = v_image[pixel];
             behind_$i = behind_all[pixel];
         }
     }

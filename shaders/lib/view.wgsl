@@ -1,4 +1,4 @@
-// What the engine keeps of a view, and of all views together. Mirrored by gpu/types.rs.
+// What the engine keeps of a view, and of all views together. Mirrored by splat/wgpu/types.rs.
 
 // Places of one view's numbers, and how many there are.
 const VIEW_QUAT: u32 = 0u;
@@ -12,7 +12,7 @@ const VIEW_POSE_AGE: u32 = 30u;
 const VIEW_EXPOSURE_AGE: u32 = 31u;
 const VIEW_EXPOSURE_M: u32 = 32u;
 const VIEW_EXPOSURE_V: u32 = 38u;
-// cam_from_map as the last step used it: rotation by columns, translation.
+// cam_from_world as the last step used it: rotation by columns, translation.
 const VIEW_NOW: u32 = 44u;
 const VIEW_EMBEDDING_AGE: u32 = 56u;
 const VIEW_EMBEDDING: u32 = 64u;

@@ -8,18 +8,22 @@ use anyhow::{Context, bail};
 use crate::cli::{
     EvalArgs, ExportArgs, ModelCheckArgs, RenderArgs, SynthArgs, Usage, mapping, say,
 };
-use crate::config::Backend;
-use crate::eval::{doctor as checks, evaluation, render, trajectory};
-use crate::export::ply;
-use crate::geometry::onnx::check::Report;
-use crate::geometry::onnx::model::Model;
-use crate::map::checkpoint;
-use crate::node;
-use crate::source::synthetic::SynthSettings;
-use crate::source::synthetic::record::write_recording;
-use crate::splat::Splats;
+use crate::doctor::check::State;
+use crate::doctor::checks;
+use crate::doctor::model_check::Report;
+use crate::eval::{evaluation, render, trajectory};
+use crate::node::engines::Engines;
+use crate::node::run_dir;
+use crate::node::save_map::{MapFile, save_map};
+use splat_geometry::foundation::model::Model;
+use splat_gpu::backend::Backend;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_synth::record::write_recording;
+use splat_synth::settings::SynthSettings;
+use splat_types::splats::ply;
+use splat_types::splats::splats::Splats;
 
-pub(super) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
     let mut settings = SynthSettings::parse(&args.scene)?;
     let flags = [
         ("frames", args.frames.map(|v| v.to_string())),
@@ -51,7 +55,7 @@ pub(super) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let evaluation = evaluation::evaluate(&args.run_dir, &args.reference)?;
     if args.json {
         say(serde_json::to_string_pretty(&evaluation)?);
@@ -61,7 +65,7 @@ pub(super) fn eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
     let backend = match args.backend.as_str() {
         "auto" => Backend::Auto,
         "cpu" => Backend::Cpu,
@@ -74,7 +78,7 @@ pub(super) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
         .into_iter()
         .map(|timed| (timed.stamp, timed.pose))
         .collect();
-    let mut engine = node::engine(backend, true)?;
+    let mut engine = Engines::default().best(backend, true)?;
     let n = render::render_poses(
         &splats,
         engine.as_mut(),
@@ -84,17 +88,17 @@ pub(super) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
         args.depth,
     )?;
     say(format!(
-        "{n} pictures of {} splats: {}",
+        "{n} images of {} splats: {}",
         splats.len(),
         args.out.display()
     ));
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let splats = read_map(&args.map)?;
     match args.out.extension().and_then(|e| e.to_str()) {
-        Some("ply") => ply::write(&splats, &args.out)?,
+        Some("ply") => save_map(MapFile::Ply(&splats), &args.out)?,
         other => bail!(
             "this build exports .ply, not {:?}: {}",
             other.unwrap_or(""),
@@ -105,8 +109,11 @@ pub(super) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn model_check(args: &ModelCheckArgs) -> anyhow::Result<ExitCode> {
-    let params = mapping::settings(&args.params)?.params()?.onnx;
+pub(crate) fn model_check(args: &ModelCheckArgs) -> anyhow::Result<ExitCode> {
+    let mut settings = mapping::settings(&args.params)?;
+    let params = settings.params()?.onnx;
+    run_dir::start_warnings()?;
+    settings.log_warnings();
     let report = Report::of(Model::open(&args.file, &params)?, &params)?;
     if args.json {
         say(serde_json::to_string_pretty(&report)?);
@@ -123,12 +130,10 @@ pub(super) fn model_check(args: &ModelCheckArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn doctor() -> ExitCode {
+pub(crate) fn doctor() -> ExitCode {
     let found = checks::doctor();
     say(checks::format_checks(&found).trim_end());
-    let is_missing = found
-        .iter()
-        .any(|check| check.state == checks::State::Missing);
+    let is_missing = found.iter().any(|check| check.state == State::Missing);
     if is_missing {
         ExitCode::FAILURE
     } else {

@@ -8,39 +8,39 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
-use crate::config::{ConfigError, Settings};
 use crate::eval::lpips;
-use crate::node::localise;
-use crate::node::pipeline;
-use crate::node::ros2;
-use crate::node::{Job, Outcome, Progress, Stop, linger, outbox, run_dir};
-use crate::source;
+use crate::node::engines::Engines;
+use crate::node::job::{Job, Outcome, Progress, linger, publisher};
+use crate::node::stop::Stop;
+use crate::node::{localise, open_source, pipeline, ros2, run_dir};
+use crate::params::error::ParamsError;
+use crate::params::settings::Settings;
 
-pub(super) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
     let mut settings = settings(&args.params)?;
     if settings.params().map_err(|e| usage(&e))?.source.rate == 0.0 {
         settings
             .set("source.rate", 1.0.into())
             .map_err(|e| usage(&e))?;
     }
-    load(&mut settings, args.map.as_deref())?;
+    resume(&mut settings, args.resume.as_deref())?;
     map(&settings, &args.source, args.out.as_deref())
 }
 
-/// `--map` is `map.load`.
-fn load(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
+/// `--resume` is `map.resume`.
+fn resume(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
     if let Some(map) = map {
         let path = map
             .to_str()
-            .ok_or_else(|| Usage(format!("--map {} is no text", map.display())))?;
+            .ok_or_else(|| Usage(format!("--resume {} is not UTF-8", map.display())))?;
         settings
-            .set("map.load", path.into())
+            .set("map.resume", path.into())
             .map_err(|e| usage(&e))?;
     }
     Ok(())
 }
 
-pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+pub(crate) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
     let mut settings = settings(&args.params)?;
     let rate = match args.rate.as_deref() {
         None => None,
@@ -58,9 +58,9 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         ("source.rate", rate.map(Into::into)),
         ("backend", args.backend.clone().map(Into::into)),
         ("geometry", args.geometry.clone().map(Into::into)),
-        ("map.steps", args.steps.map(Into::into)),
+        ("train.steps", args.steps.map(Into::into)),
         ("source.max_side", args.max_side.map(Into::into)),
-        ("map.max_side", args.max_side.map(Into::into)),
+        ("train.max_side", args.max_side.map(Into::into)),
         ("seed", args.seed.map(Into::into)),
         ("map.holdout", args.holdout.map(Into::into)),
     ];
@@ -69,32 +69,38 @@ pub(super) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
             settings.set(key, value).map_err(|e| usage(&e))?;
         }
     }
-    load(&mut settings, args.map.as_deref())?;
+    resume(&mut settings, args.resume.as_deref())?;
     map(&settings, &args.input, args.out.as_deref())
 }
 
-pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
-    let params = settings(&args.params)?.params().map_err(|e| usage(&e))?;
+pub(crate) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
+    let mut settings = settings(&args.params)?;
+    let params = settings.params().map_err(|e| usage(&e))?;
     if let Some(out) = &args.out {
         run_dir::prepare(out)?;
     }
     run_dir::start_log(args.out.as_deref(), std::io::stderr().is_terminal())?;
-    let mut source = source::open(&args.input, &params.source, params.seed)?;
+    settings.log_warnings();
+    let mut source = open_source::open(&args.input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
     source.end_when(stop.flag());
     let out = args.out.as_deref();
     let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
-    let told = &found.tracking;
+    let reported = &found.tracking;
     if args.json {
         say(serde_json::to_string_pretty(&found)?);
     } else {
         say(format!(
             "{} of {} frames found among {} keyframes, {} times lost, {} times found again",
-            told.tracked, told.frames, found.map_keyframes, told.lost, told.relocalised
+            reported.tracked,
+            reported.frames,
+            found.map_keyframes,
+            reported.lost,
+            reported.relocalised
         ));
     }
-    if told.tracked == 0 {
+    if reported.tracked == 0 {
         let reason = found
             .reason
             .unwrap_or_else(|| "there are no frames".to_owned());
@@ -106,7 +112,7 @@ pub(super) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
+pub(crate) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
     let mut settings = Settings::shipped();
     if let Some(preset) = &args.preset {
         settings.merge_preset(preset).map_err(|e| usage(&e))?;
@@ -120,7 +126,7 @@ pub(super) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
     Ok(settings)
 }
 
-fn usage(error: &ConfigError) -> Usage {
+fn usage(error: &ParamsError) -> Usage {
     Usage(error.to_string())
 }
 
@@ -131,18 +137,19 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     }
     run_dir::start_log(out, is_terminal)?;
     let mut settings = settings.clone();
+    settings.log_warnings();
     let ros2 = ros2::join(&mut settings, input)?;
     let settings = &settings;
     let params = settings.params().map_err(|e| usage(&e))?;
     // A network that cannot be used is better known before the work than after it.
     let lpips = lpips::lpips(&params.eval.lpips_model)?;
-    let source = source::open(input, &params.source, params.seed)?;
+    let source = open_source::open(input, &params.source, params.seed)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
-    let face = ros2.as_ref().map(ros2::Node::face).transpose()?;
-    let outbox = outbox(&params, face)?;
-    if let (Some(node), Some(outbox)) = (&ros2, &outbox) {
-        node.serve(outbox, &stop, params.ros2.autostart)?;
+    let transport = ros2.as_ref().map(ros2::Node::transport).transpose()?;
+    let publisher = publisher(&params, transport)?;
+    if let (Some(node), Some(publisher)) = (&ros2, &publisher) {
+        node.serve(publisher, &stop, params.ros2.autostart)?;
     }
     let is_live = source.is_live() || params.source.rate > 0.0;
     let job = Job {
@@ -151,7 +158,8 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         is_live,
         stop: stop.clone(),
         out: out.map(Path::to_owned),
-        outbox,
+        publisher,
+        engines: Engines::default(),
     };
     let bar = bar(is_terminal);
     let outcome = pipeline::run(job, &mut |progress| show(&bar, progress));
@@ -159,7 +167,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let mut outcome = outcome?;
     let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;
     say(summary);
-    linger(&mut outcome, params.publish.linger_secs, &stop);
+    linger(&mut outcome, params.publish.shutdown_delay, &stop);
     verdict(&outcome, input)
 }
 
@@ -174,16 +182,16 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     }
     if !outcome.snapshot.poses.is_empty() && outcome.snapshot.splats.is_empty() {
         anyhow::bail!(
-            "no splat could be placed, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
+            "no splat could be registered, since no depth was verified between {} keyframes: move the camera sideways, or look at something with texture: {input}",
             outcome.snapshot.poses.len()
         );
     }
-    if let Some(continued) = outcome.map.continuation().filter(|c| !c.is_joined) {
+    if let Some(resume_report) = outcome.map.continuation().filter(|c| !c.is_joined) {
         anyhow::bail!(
             "the recording has no place in the map: {} of {} keyframes were found among the {} of the map, 3 or more must agree; the saved map is as it was, and the recording must see what it was made of, in similar light: {input}",
-            continued.found,
-            continued.asked,
-            continued.keyframes
+            resume_report.found,
+            resume_report.asked,
+            resume_report.keyframes
         );
     }
     if outcome.snapshot.poses.is_empty() {
@@ -213,7 +221,7 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-pub(super) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
+pub(crate) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {
         if stop.is_asked() {
@@ -239,7 +247,7 @@ fn bar(is_terminal: bool) -> ProgressBar {
 fn show(bar: &ProgressBar, progress: Progress) {
     let text = format!(
         "{} of {} keyframes, {} splats",
-        progress.n_placed, progress.n_keyframes, progress.n_splats
+        progress.n_registered, progress.n_keyframes, progress.n_splats
     );
     if bar.is_hidden() {
         tracing::info!(

@@ -7,15 +7,15 @@ use std::path::Path;
 use glam::DVec3;
 use serde::Serialize;
 
-use super::EvalError;
-use super::align::{AlignError, Alignment, align};
-use super::figures::ordinal;
-use super::report::{Quality, Report};
-use super::trajectory::{
+use crate::eval::alignment::{AlignError, Alignment, align};
+use crate::eval::error::EvalError;
+use crate::eval::numbers::ordinal;
+use crate::eval::report_json::{Quality, Report};
+use crate::eval::trajectory::{
     TOLERANCE_SECS, TimedPose, associate, read_tum, shifted, stamp_offset_nanos,
 };
-use crate::pose::{Rigid, Similarity, extent};
-use crate::source::scene_formats::{Layout, SceneView};
+use splat_io::scene_formats::scene::{Layout, SceneView};
+use splat_types::transform::{Rigid, Similarity, extent};
 
 /// What `eval --json` prints. A figure that has no value is null and `note` says why.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -231,18 +231,18 @@ impl std::fmt::Display for Evaluation {
 }
 
 fn read_reference(path: &Path) -> Result<Vec<TimedPose>, EvalError> {
-    let beside_pictures = path.join("poses_tum.txt");
-    if beside_pictures.is_file() {
-        return read_poses(&beside_pictures);
+    let beside_images = path.join("poses_tum.txt");
+    if beside_images.is_file() {
+        return read_poses(&beside_images);
     }
     let Some(layout) = Layout::find(path) else {
         return read_poses(path);
     };
-    // Sizes of pictures do not matter here.
+    // Sizes of images do not matter here.
     let views = layout.views(u32::MAX)?;
     let timed = |view: &SceneView| TimedPose {
         stamp: view.stamp,
-        pose: view.world_from_cam,
+        pose: view.gt_from_cam,
     };
     Ok(views.iter().map(timed).collect())
 }

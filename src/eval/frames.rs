@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::trajectory::TimedPose;
-use super::{EvalError, write_atomically};
-use crate::clock::Stamp;
-use crate::pose::Rigid;
-use crate::track::{FrameTrack, State};
+use crate::eval::error::{EvalError, write_atomically};
+use crate::eval::trajectory::TimedPose;
+use splat_slam::track::history::FrameTrack;
+use splat_types::time::Stamp;
+use splat_types::tracking::TrackState;
+use splat_types::transform::Rigid;
 
 const HEADER: &str = "stamp_s,pose,state,inliers,std_translation,std_rotation_deg,reason\n";
 /// Poses are carried over a gap between two measured ones up to this: what a tracker may guess before it is lost.
@@ -138,10 +139,10 @@ fn table(rows: &[FrameRow]) -> String {
             Source::Missing => "missing",
         };
         let state = row.track.map_or("", |track| match track.state {
-            State::Initialising => "initialising",
-            State::Tracking => "tracking",
-            State::Lost => "lost",
-            State::Relocalised => "relocalised",
+            TrackState::Initialising => "initialising",
+            TrackState::Tracking => "tracking",
+            TrackState::Lost => "lost",
+            TrackState::Relocalised => "relocalised",
         });
         let n_inliers = row.track.map_or(0, |track| track.n_inliers);
         let std = row.track.and_then(|track| track.std);
@@ -175,7 +176,7 @@ mod tests {
         FrameTrack {
             seq: ix as u64,
             stamp: stamp(ix),
-            state: State::Tracking,
+            state: TrackState::Tracking,
             reason: None,
             n_inliers: 40,
             std: Some((0.01, 0.2)),

@@ -4,7 +4,7 @@
 
 use rayon::prelude::*;
 
-use crate::frame::RgbImage;
+use splat_types::image::RgbImage;
 
 /// Gaussian window of Wang et al. 2004, section III.B: 11 taps, sigma 1.5.
 const WINDOW_TAPS: usize = 11;
@@ -13,7 +13,7 @@ const WINDOW_SIGMA: f64 = 1.5;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// Peak signal-to-noise ratio in dB over all pixels and channels; infinite for equal pictures.
+/// Peak signal-to-noise ratio in dB over all pixels and channels; infinite for equal images.
 /// `rendered` holds r g b per pixel, as `Rendering::rgb`.
 pub fn psnr(rendered: &[f32], photo: &RgbImage) -> f64 {
     assert_eq!(
@@ -29,8 +29,8 @@ pub fn psnr(rendered: &[f32], photo: &RgbImage) -> f64 {
     -10.0 * mean_square.log10()
 }
 
-/// Mean structural similarity: over the windows that lie wholly inside the picture, then over the channels.
-/// A picture with a side below 11 px gets the largest odd window that fits it.
+/// Mean structural similarity: over the windows that lie wholly inside the image, then over the channels.
+/// An image with a side below 11 px gets the largest odd window that fits it.
 pub fn ssim(rendered: &[f32], photo: &RgbImage) -> f64 {
     assert_eq!(
         rendered.len(),
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn small_pictures_get_a_smaller_window() {
+    fn small_images_get_a_smaller_window() {
         for (width, height, taps) in [(8, 20, 7), (7, 9, 7), (11, 11, 11), (1, 30, 1), (2, 2, 1)] {
             let (rendered, photo) = pair(width, height);
             let (value, expected) = (ssim(&rendered, &photo), naive_ssim(&rendered, &photo, taps));
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_pictures_have_ssim_one() {
+    fn equal_images_have_ssim_one() {
         let (_, photo) = pair(16, 16);
         let same: Vec<f32> = photo.pixels.iter().map(|&p| f32::from(p) / 255.0).collect();
         assert!(

@@ -1,11 +1,11 @@
-//! Two pictures -> their LPIPS distance, by a network that the user supplies as an ONNX file.
+//! Two images -> their LPIPS distance, by a network that the user supplies as an ONNX file.
 //!
 //! The contract stands in docs/FORMATS.md: two inputs [1, 3, H, W] in [-1, 1], one number out.
 
 use std::path::{Path, PathBuf};
 
-use crate::frame::RgbImage;
-use crate::onnx::{Network, NetworkOptions, OnnxError, Tensor, network};
+use splat_geometry::inference::{Network, NetworkOptions, OnnxError, Tensor, network};
+use splat_types::image::RgbImage;
 
 #[derive(Debug, thiserror::Error)]
 pub enum LpipsError {
@@ -41,14 +41,14 @@ impl Lpips {
         let n_inputs = network.inputs().len();
         if n_inputs != 2 {
             return Err(LpipsError::Model {
-                reason: format!("{n_inputs} inputs, expected two pictures"),
+                reason: format!("{n_inputs} inputs, expected two images"),
                 path: network.path().to_owned(),
             });
         }
         Ok(Self { network })
     }
 
-    /// 0 for equal pictures. `rendered` holds r, g, b of every pixel from 0 to 1, at the size of the photo.
+    /// 0 for equal images. `rendered` holds r, g, b of every pixel from 0 to 1, at the size of the photo.
     pub fn distance(&mut self, rendered: &[f32], photo: &RgbImage) -> Result<f64, LpipsError> {
         let (width, height) = (i64::from(photo.width_px), i64::from(photo.height_px));
         let tensor = |values: Vec<f32>| Tensor {

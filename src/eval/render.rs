@@ -1,4 +1,4 @@
-//! Pictures of a map from given poses, as `splat-mapper render` writes them.
+//! Images of a map from given poses, as `splat-mapper render` writes them.
 //!
 //! The caller loads the map and picks the engine; here are the file formats on both sides.
 
@@ -6,19 +6,21 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::pictures::{depth_png, png, rgb_of};
-use super::{EvalError, read_text, write_atomically};
-use crate::camera::Intrinsics;
-use crate::clock::Stamp;
-use crate::pose::Rigid;
-use crate::splat::{Engine, Rendering, Splats};
+use crate::eval::error::{EvalError, read_text, write_atomically};
+use crate::eval::images::{depth_png, png, rgb_of};
+use splat_engine::traits::Engine;
+use splat_types::camera::Intrinsics;
+use splat_types::rendering::Rendering;
+use splat_types::splats::splats::Splats;
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// Pixels of one picture: 100 Mpx are 2 GB of buffers in the engine, more is a mistake in the file.
+/// Pixels of one image: 100 Mpx are 2 GB of buffers in the engine, more is a mistake in the file.
 const MAX_PIXELS: f64 = 1e8;
 
-/// Renders `map` from each `map_from_cam` into `out/000000.png`, and depth into `out/depth/000000.png`: 16 bits,
+/// Renders `map` from each `world_from_cam` into `out/000000.png`, and depth into `out/depth/000000.png`: 16 bits,
 /// 1000 steps a map unit, 0 = nothing there. `out/images.txt` lists stamps and files, so that `images:` sources read
 /// the folder. `engine` holds no splats yet. Returns how many poses were rendered.
 pub fn render_poses(
@@ -30,7 +32,7 @@ pub fn render_poses(
     depth: bool,
 ) -> Result<usize, EvalError> {
     assert_eq!(
-        engine.n_splats(),
+        engine.len(),
         0,
         "the engine renders this map and nothing else"
     );
@@ -38,12 +40,12 @@ pub fn render_poses(
     let folder = if depth { &depth_out } else { out };
     std::fs::create_dir_all(folder)
         .map_err(|e| EvalError::writing("the folder of renders", &e, folder))?;
-    engine.append(splats);
+    engine.append(splats)?;
     let mut list = "# timestamp filename\n".to_owned();
-    for (ix, (stamp, map_from_cam)) in poses.iter().enumerate() {
-        let rendering = engine.render(intrinsics, &map_from_cam.inverse(), splats.sh_degree);
+    for (ix, (stamp, world_from_cam)) in poses.iter().enumerate() {
+        let rendering = engine.render(intrinsics, &world_from_cam.inverse(), splats.sh_degree)?;
         let name = format!("{ix:06}.png");
-        write_picture(&rendering, &out.join(&name))?;
+        write_image(&rendering, &out.join(&name))?;
         if depth {
             write_depth(&rendering, &depth_out.join(&name))?;
         }
@@ -89,7 +91,7 @@ pub fn read_intrinsics(path: &Path) -> Result<Intrinsics, EvalError> {
     };
     if file.width * file.height > MAX_PIXELS {
         return Err(wrong(
-            "the picture is larger than 100 megapixels",
+            "the image is larger than 100 megapixels",
             format!("{width_px} x {height_px}"),
         ));
     }
@@ -126,7 +128,7 @@ struct IntrinsicsFile {
     model: Option<String>,
 }
 
-fn write_picture(rendering: &Rendering, path: &Path) -> Result<(), EvalError> {
+fn write_image(rendering: &Rendering, path: &Path) -> Result<(), EvalError> {
     let bytes = png(&rgb_of(rendering)).map_err(|e| EvalError::writing("a render", &e, path))?;
     write_atomically("a render", &bytes, path)
 }

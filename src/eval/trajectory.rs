@@ -7,15 +7,15 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3};
 
-use super::{EvalError, read_text, write_atomically};
-use crate::clock::Stamp;
-use crate::pose::Rigid;
+use crate::eval::error::{EvalError, read_text, write_atomically};
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
 /// Stamps further apart are different moments. The convention of the TUM tools is 0.02 s at 30 Hz; the stamps here
 /// are copies of the same header stamps, so half of that only has to cover rounding and jitter.
 pub const TOLERANCE_SECS: f64 = 0.01;
 
-/// Hours of motion capture at 1 kHz fit; a picture or a bag named by mistake does not.
+/// Hours of motion capture at 1 kHz fit; an image or a bag named by mistake does not.
 const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// Beyond this a coordinate is a mistake, and its square leaves the range of numbers.
@@ -26,7 +26,7 @@ const QUATERNION_SLACK: f64 = 0.05;
 
 const HEADER: &str = "# t tx ty tz qx qy qz qw  (seconds; camera to world, OpenCV axes: x right, y down, z forward)\n";
 
-/// Where something was, and when. The file says which frames the pose relates; here mostly `map_from_cam`.
+/// Where something was, and when. The file says which frames the pose relates; here mostly `world_from_cam`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TimedPose {
     pub stamp: Stamp,

@@ -1,17 +1,19 @@
 //! The map while it grows -> the run directory's map file, every so often, on a thread of its own.
 //!
-//! The map thread hands over a copy; packing pictures and writing happen here. While one file is written, newer copies
+//! The map thread hands over a copy; packing images and writing happen here. While one file is written, newer copies
 //! replace each other. A crash loses what came since.
 
 use std::path::Path;
 use std::thread::JoinHandle;
 
-use crate::clock::Stopwatch;
-use crate::map::SplatMap;
-use crate::map::checkpoint::{self, Checkpoint};
-use crate::node::outward::Clerk;
-use crate::node::spawn;
-use crate::queue::{Sender, WhenFull, queue};
+use crate::node::job::spawn;
+use crate::node::requests::RequestHandler;
+use crate::node::save_map::{MapFile, save_map};
+use splat_engine::error::EngineError;
+use splat_io::queue::{Sender, WhenFull, queue};
+use splat_slam::mapper::map_file::checkpoint::Checkpoint;
+use splat_slam::mapper::mapper::Mapper;
+use splat_types::time::Stopwatch;
 
 /// The side of the map thread.
 #[derive(Debug)]
@@ -33,7 +35,7 @@ impl Autosave {
         let writer = spawn("autosave", move || {
             while let Some(checkpoint) = taken.recv() {
                 // The next one may find room; the run goes on.
-                if let Err(e) = checkpoint::write(&checkpoint, &path) {
+                if let Err(e) = save_map(MapFile::Checkpoint(&checkpoint), &path) {
                     tracing::warn!("{e}");
                 }
             }
@@ -47,17 +49,22 @@ impl Autosave {
     }
 
     /// Takes a copy where it is time for one; an older one that still waits is given up for it.
-    pub(super) fn save_if_due(this: Option<&mut Self>, map: &mut SplatMap, clerk: &mut Clerk) {
+    pub(crate) fn save_if_due(
+        this: Option<&mut Self>,
+        map: &mut Mapper,
+        request_handler: &mut RequestHandler,
+    ) -> Result<(), EngineError> {
         let is_due = |this: &&mut Self| this.since.secs() >= this.every_secs;
         let Some(this) = this.filter(is_due).filter(|_| map.n_splats() > 0) else {
-            return;
+            return Ok(());
         };
         this.since = Stopwatch::start();
-        let snapshot = map.snapshot();
-        let copy = map.checkpoint(&snapshot, clerk.landmarks().to_vec());
+        map.snapshot()?;
+        let copy = map.checkpoint(request_handler.landmarks().to_vec());
         if let Some(copies) = &this.copies {
             drop(copies.send(Box::new(copy)));
         }
+        Ok(())
     }
 }
 

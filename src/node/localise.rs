@@ -5,19 +5,22 @@ use std::path::Path;
 use anyhow::{Context as _, anyhow, bail};
 use serde::Serialize;
 
-use crate::clock::Stopwatch;
-use crate::config::Params;
-use crate::config::track::Photometric;
 use crate::eval::frames;
-use crate::eval::report::TrackingFigures;
+use crate::eval::report_json::TrackingFigures;
 use crate::eval::trajectory::write_tum;
-use crate::map::snapshot::Scale;
-use crate::map::{SplatMap, checkpoint};
+use crate::node::engines::Engines;
+use crate::node::page_file::PageFile;
 use crate::node::run_dir::tracking_figures;
-use crate::node::track_stage::TrackStage;
-use crate::node::{Grace, Stop, engine};
-use crate::source::Source;
-use crate::track::Tracker;
+use crate::node::stop::{ShutdownTimeout, Stop};
+use crate::node::track_thread::TrackStage;
+use crate::params::params::Params;
+use splat_io::frame_source::Source;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_slam::mapper::mapper::Mapper;
+use splat_slam::track::params::Photometric;
+use splat_slam::track::tracker::Tracker;
+use splat_types::snapshot::Scale;
+use splat_types::time::Stopwatch;
 
 /// What came of it, `localisation.json`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,19 +56,31 @@ pub fn localise(
         .with_context(|| format!("cannot find a place in {}", map.display()))?;
     let map_keyframes = tracker.n_keyframes();
     let mut splats = if params.track.photometric == Photometric::Always {
-        let engine = engine(params.backend, params.deterministic)?;
-        let empty = SplatMap::new(params.map.clone(), params.seed, Scale::UP_TO_SCALE, engine);
-        let loaded = empty.continued(saved, &params.track);
+        let engine = Engines::default().best(params.backend, params.deterministic)?;
+        let pages = PageFile::new(None, params.map.max_page_file_mib << 20);
+        let empty = Mapper::new(params.mapper(), params.seed, Scale::UP_TO_SCALE, engine)
+            .paging_to(Box::new(pages));
+        let loaded = empty.resume_report(saved, &params.track);
         Some(loaded.map_err(|reason| anyhow!("cannot look at {}: {reason}", map.display()))?)
     } else {
         None
     };
     let mut stage = TrackStage::of(Some(tracker), false);
-    stage.grace = Grace::new(stop.clone());
+    stage.grace = ShutdownTimeout::new(stop.clone());
     while let Some(frame) = source.next().filter(|_| !stop.is_asked()) {
         stage.track(&frame, &Stopwatch::start());
         if let Some(splats) = &mut splats {
-            stage.fit(&mut |placement| splats.fit_placement(placement, &frame));
+            let mut fault = None;
+            stage.fit(&mut |placement| {
+                let found = splats.fit_placement(placement, &frame);
+                found.unwrap_or_else(|error| {
+                    fault = Some(error);
+                    None
+                })
+            });
+            if let Some(error) = fault {
+                return Err(error).context("cannot compare frames with the map");
+            }
         }
     }
     let tracking = stage.finish(0);
@@ -85,7 +100,7 @@ pub fn localise(
         frames::write_frames(&rows, &out.join("frames.csv"))?;
         let text = serde_json::to_vec_pretty(&found)?;
         let path = out.join("localisation.json");
-        crate::atomic::write_file(&path, |file| std::io::Write::write_all(file, &text))
+        splat_io::whole_file::write_file(&path, |file| std::io::Write::write_all(file, &text))
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
     Ok(found)

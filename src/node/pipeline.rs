@@ -4,34 +4,35 @@ use std::sync::mpsc::Receiver as Calls;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use crate::clock::Stopwatch;
-use crate::config::track::Photometric;
-use crate::frame::Batch;
-use crate::geometry::{GeometryError, GeometryModel};
-use crate::map::snapshot::{Scale, Snapshot};
-use crate::node::fitting;
-use crate::node::geometry_stage::{GeometryStage, GeometryTally, run_geometry};
-use crate::node::opening;
-use crate::node::outward::{self, Complaints, run_live, run_publisher};
-use crate::node::source_stage::SourceStage;
-use crate::node::stages::{MapStage, SelectStage};
+use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
+use crate::node::job::{Job, Outcome, Progress, StageSecs, model, spawn};
+use crate::node::map_stage::{MapStage, SelectStage};
+use crate::node::publish_threads::{self, RateLimitedLog, run_live, run_publisher};
+use crate::node::source_thread::SourceStage;
 use crate::node::threads::{Answer, joined, run_select, run_source};
-use crate::node::track_stage::{News, TrackStage, Tracking, run_track};
-use crate::node::{Job, Outcome, Progress, StageSecs, model, spawn};
-use crate::publish::outbox::Outbox;
-use crate::publish::service::Call;
-use crate::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
+use crate::node::track_thread::{KeyframeUpdate, TrackStage, TrackingSummary, run_track};
+use crate::node::{open, refinement};
+use splat_geometry::error::GeometryError;
+use splat_geometry::model::GeometryModel;
+use splat_io::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
+use splat_ros::publisher::Publisher;
+use splat_ros::service_server::ServiceCall;
+use splat_slam::track::params::Photometric;
+use splat_types::correction::MapCorrection;
+use splat_types::frame::Batch;
+use splat_types::snapshot::{Scale, Snapshot};
+use splat_types::time::Stopwatch;
 
 /// Frames between source and selection.
 const FRAME_QUEUE: usize = 4;
 /// Frames before the tracker: live, an older one is worth nothing once two newer ones are there.
-const HEARD_QUEUE: usize = 2;
+const INPUT_QUEUE: usize = 2;
 /// Poses on their way out.
 const EVENT_QUEUE: usize = 8;
 /// How long a call from outside may wait while the map has nothing to do.
 const CALL_TICK: Duration = Duration::from_millis(100);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
-const NEWS_SECS: f64 = 1.0;
+const UPDATE_SECS: f64 = 1.0;
 
 /// Runs a job to its end; a reset on the way throws the map away and goes on with the same source. `on_progress` is
 /// called on this thread.
@@ -39,31 +40,36 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
     let watch = Stopwatch::start();
     let mut calls = None;
     loop {
-        let (mut params, stop, outbox) = (job.params.clone(), job.stop.clone(), job.outbox.clone());
-        let (is_live, out) = (job.is_live, job.out.clone());
+        let (mut params, stop, publisher) =
+            (job.params.clone(), job.stop.clone(), job.publisher.clone());
+        let (is_live, out, engines) = (job.is_live, job.out.clone(), job.engines.clone());
         let mut ended = run_once(job, calls.take(), on_progress)?;
         if !stop.takes_restart() {
-            let mut outcome = ended.into_outcome(outbox, stop.is_asked());
+            let mut outcome = ended.into_outcome(publisher, stop.is_asked());
             outcome.secs.wall = watch.secs();
             return Ok(outcome);
         }
         tracing::info!("the map begins again");
-        calls = ended.map.clerk.take_calls();
-        params.map.load = ended.map.clerk.take_wanted();
+        calls = ended.map.request_handler.take_calls();
+        params.map.resume = ended.map.request_handler.take_wanted();
+        if let Some(publisher) = &publisher {
+            publisher.queue_correction(MapCorrection::restart(!params.map.resume.is_empty()));
+        }
         job = Job {
             source: ended.source.into_source(),
             params,
             is_live,
             stop,
-            outbox,
+            publisher,
             out,
+            engines,
         };
     }
 }
 
 fn run_once(
     job: Job,
-    calls: Option<Calls<Call>>,
+    calls: Option<Calls<ServiceCall>>,
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
@@ -74,27 +80,27 @@ fn run_with(
     model: Box<dyn GeometryModel>,
     scale: Scale,
     job: Job,
-    calls: Option<Calls<Call>>,
+    calls: Option<Calls<ServiceCall>>,
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
-    let opening::Opened {
+    let open::Opened {
         mut map,
         mut track,
         first_id,
-    } = opening::open(&job, scale, calls)?;
+    } = open::open(&job, scale, calls)?;
     let fits = job.params.track.photometric != Photometric::Off;
     if job.is_live && fits && track.is_on() {
-        let (asker, fitter) = fitting::pair();
-        (track.asker, map.fitter) = (Some(asker), Some(fitter));
+        let (client, fitter) = refinement::pair();
+        (track.client, map.fitter) = (Some(client), Some(fitter));
     }
-    let outbox = job.outbox;
+    let publisher = job.publisher;
     let stages = Stages {
         map,
         select: SelectStage::new(&job.params, first_id),
         geometry: GeometryStage::new(model, &job.params),
-        track: track.heard(outbox.is_some()),
-        source: SourceStage::new(job.source, job.stop, outbox.clone()),
-        outbox,
+        track: track.received(publisher.is_some()),
+        source: SourceStage::new(job.source, job.stop, publisher.clone()),
+        publisher,
     };
     if job.params.sequential {
         Ok(stages.in_sequence(on_progress))
@@ -109,7 +115,7 @@ struct Stages {
     geometry: GeometryStage,
     map: MapStage,
     track: TrackStage,
-    outbox: Option<Arc<Outbox>>,
+    publisher: Option<Arc<Publisher>>,
 }
 
 /// All stages after their end.
@@ -119,7 +125,7 @@ struct End {
     select: SelectStage,
     geometry: GeometryTally,
     map: MapStage,
-    tracking: Tracking,
+    tracking: TrackingSummary,
     snapshot: Arc<Snapshot>,
     error: Option<String>,
 }
@@ -127,27 +133,31 @@ struct End {
 impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
-        let outbox = self.outbox;
-        let (mut of_map, mut of_live) = (Complaints::default(), Complaints::default());
+        let publisher = self.publisher;
+        let (mut of_map, mut of_live) = (RateLimitedLog::default(), RateLimitedLog::default());
         let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
-            if let Some(outbox) = &outbox {
-                outward::publish_or_say(outbox, &(snapshot, progress.has_ended), &mut of_map);
+            if let Some(publisher) = &publisher {
+                publish_threads::publish_snapshot(
+                    publisher,
+                    &(snapshot, progress.has_ended),
+                    &mut of_map,
+                );
             }
             on_progress(progress);
         };
-        let mut tell = |track: &mut TrackStage| {
+        let mut report = |track: &mut TrackStage| {
             let events = track.take_events();
-            if let Some(outbox) = &outbox {
-                outward::say_all(outbox, &events, &mut of_live);
+            if let Some(publisher) = &publisher {
+                publish_threads::publish_events(publisher, &events, &mut of_live);
             }
         };
         let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
         let track = &mut self.track;
         let mut map_batch = |batch: Batch, track: &mut TrackStage| -> Result<(), GeometryError> {
             let answer = geometry.infer(&batch)?;
-            map.add(Some(&batch), answer, &mut publish);
+            map.add(Some(&batch), &answer, &mut publish);
             if track.is_on() {
-                track.update(&map.map.keyframe_views());
+                track.update(&map.keyframe_views());
             }
             Ok(())
         };
@@ -157,7 +167,7 @@ impl Stages {
                 break;
             };
             track.track(&frame, &Stopwatch::start());
-            tell(track);
+            report(track);
             if let Some(batch) = select.push(frame) {
                 result = map_batch(batch, track);
             }
@@ -169,18 +179,18 @@ impl Stages {
         }
         let result = result.and_then(|()| {
             let rest = geometry.finish()?;
-            map.add(None, rest, &mut publish);
+            map.add(None, &rest, &mut publish);
             Ok(())
         });
         let snapshot = map.finish(&mut publish);
-        track.update(&map.map.keyframe_views());
-        tell(track);
+        track.update(&map.keyframe_views());
+        report(track);
         End {
             tracking: self.track.finish(0),
             source: self.source,
             n_dropped: 0,
             select: self.select,
-            geometry: told(&self.geometry.tally()),
+            geometry: summary(&self.geometry.tally()),
             map: self.map,
             snapshot,
             error: result.err().map(|e| format!("geometry: {e}")),
@@ -201,35 +211,36 @@ impl Stages {
         let (snapshots_tx, snapshots) = queue("snapshots", 1, WhenFull::DropOldest);
         let (progress_tx, progress) = queue("progress", 1, WhenFull::DropOldest);
 
-        let (heard_tx, heard) = queue("heard", HEARD_QUEUE, when_full);
-        let (news_tx, news) = queue("news", 1, when_full);
+        let (input_tx, received) = queue("tracker input", INPUT_QUEUE, when_full);
+        let (updates_tx, updates) = queue("keyframe updates", 1, when_full);
         // Live, the tracker must not wait for selection; in a replay, selection says what it has to wait for.
-        let heard_tx = self.track.is_on().then_some(heard_tx);
-        let news_tx = self.track.is_on().then_some(news_tx);
+        let input_tx = self.track.is_on().then_some(input_tx);
+        let updates_tx = self.track.is_on().then_some(updates_tx);
         let (from_source, from_select) = if is_live {
-            (heard_tx, None)
+            (input_tx, None)
         } else {
-            (None, heard_tx)
+            (None, input_tx)
         };
 
         let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
-        let outbox = self.outbox.clone();
-        let live = outbox.map(|outbox| spawn("live", move || run_live(&outbox, &events)));
+        let publisher = self.publisher.clone();
+        let live = publisher.map(|publisher| spawn("live", move || run_live(&publisher, &events)));
         let live = live.transpose()?;
         let track = spawn("track", move || {
-            run_track(self.track, &heard, &news, &events_tx)
+            run_track(self.track, &received, &updates, &events_tx)
         })?;
         let source = spawn("source", move || {
             run_source(self.source, &frames_tx, from_source.as_ref())
         })?;
-        let pace = is_live.then(|| Arc::new(self.geometry.pace()));
-        let paced = pace.clone();
+        let backpressure = is_live.then(|| Arc::new(self.geometry.backpressure()));
+        let paced = backpressure.clone();
         let select = spawn("select", move || {
-            let (heard, pace) = (from_select.as_ref(), paced.as_deref());
-            run_select(self.select, &frames, &batches_tx, heard, pace)
+            let (received, backpressure) = (from_select.as_ref(), paced.as_deref());
+            run_select(self.select, &frames, &batches_tx, received, backpressure)
         })?;
         let geometry = spawn("geometry", move || {
-            run_geometry(self.geometry, &batches, &answers_tx, pace.as_deref())
+            let limit = backpressure.as_deref();
+            run_geometry(self.geometry, &batches, &answers_tx, limit)
         })?;
         let map = spawn("map", move || {
             let mut publish = |snapshot, progress: Progress| {
@@ -238,16 +249,12 @@ impl Stages {
                 drop(snapshots_tx.send((snapshot, is_last)));
                 progress_tx.send(progress).ok();
             };
-            run_map(
-                self.map,
-                (is_live, news_tx.as_ref()),
-                &answers,
-                &mut publish,
-            )
+            let updates = (is_live, updates_tx.as_ref());
+            run_map(self.map, updates, &answers, &mut publish)
         })?;
-        let outbox = self.outbox;
-        let publisher = spawn("publish", move || {
-            run_publisher(outbox.as_deref(), &snapshots);
+        let publisher = self.publisher;
+        let publish_thread = spawn("publish", move || {
+            run_publisher(publisher.as_deref(), &snapshots);
         })?;
 
         while let Some(progress) = progress.recv() {
@@ -264,7 +271,7 @@ impl Stages {
         };
         let (source, n_dropped) = joined("source", source)?;
         let select = joined("select", select)?;
-        joined("publish", publisher)?;
+        joined("publish", publish_thread)?;
         let tracking = joined("track", track)?;
         live.map(|live| joined("live", live)).transpose()?;
         Ok(End {
@@ -272,7 +279,7 @@ impl Stages {
             source,
             n_dropped,
             select,
-            geometry: told(&tally),
+            geometry: summary(&tally),
             map,
             snapshot,
             error: error.map(|e| format!("geometry: {e}")),
@@ -289,7 +296,7 @@ fn when_full(is_live: bool) -> WhenFull {
     }
 }
 
-fn told(tally: &Mutex<GeometryTally>) -> GeometryTally {
+fn summary(tally: &Mutex<GeometryTally>) -> GeometryTally {
     tally.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
@@ -302,8 +309,8 @@ enum Ending {
 }
 
 impl End {
-    fn into_outcome(self, outbox: Option<Arc<Outbox>>, was_stopped: bool) -> Outcome {
-        let fault = self.map.map.fault().map(|fault| format!("engine: {fault}"));
+    fn into_outcome(self, publisher: Option<Arc<Publisher>>, was_stopped: bool) -> Outcome {
+        let fault = self.map.recovery.error;
         Outcome {
             snapshot: self.snapshot,
             counts: self.source.counts(),
@@ -321,31 +328,32 @@ impl End {
             tracking: self.tracking,
             keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
             keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
-            clerk: self.map.clerk.at_end(),
+            request_handler: self.map.request_handler.at_end(),
             map: self.map.map,
             geometry_note: self.geometry.note,
+            n_engine_faults: self.map.recovery.n_faults,
             error: self.error.or(fault),
             was_stopped,
-            outbox,
+            publisher,
         }
     }
 }
 
 fn run_map(
     mut stage: MapStage,
-    (is_live, news): (bool, Option<&Sender<News>>),
+    (is_live, updates): (bool, Option<&Sender<KeyframeUpdate>>),
     answers: &Receiver<Answer>,
     publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
 ) -> (MapStage, Arc<Snapshot>, Ending) {
-    let mut since_news = Stopwatch::start();
+    let mut since_update = Stopwatch::start();
     let ending = loop {
         let answer = if is_live {
             match answers.try_recv() {
                 Ok(Some(answer)) => Ok(answer),
                 Ok(None) if stage.step_while_waiting(publish) => {
-                    if since_news.secs() > NEWS_SECS {
-                        send_news(&mut stage, news);
-                        since_news = Stopwatch::start();
+                    if since_update.secs() > UPDATE_SECS {
+                        send_updates(&mut stage, updates);
+                        since_update = Stopwatch::start();
                     }
                     continue;
                 }
@@ -359,11 +367,11 @@ fn run_map(
             Ok(answer) => answer,
             Err(ending) => break ending,
         };
-        stage.add(batch.as_deref(), geometry, publish);
-        send_news(&mut stage, news);
+        stage.add(batch.as_deref(), &geometry, publish);
+        send_updates(&mut stage, updates);
     };
     let snapshot = stage.finish(publish);
-    send_news(&mut stage, news);
+    send_updates(&mut stage, updates);
     (stage, snapshot, ending)
 }
 
@@ -372,7 +380,7 @@ fn next_answer(stage: &mut MapStage, answers: &Receiver<Answer>) -> Result<Answe
     loop {
         match answers.recv_timeout(CALL_TICK) {
             Received::Item(answer) => return Ok(answer),
-            Received::Nothing if stage.gives_up() => {
+            Received::Nothing if stage.timed_out() => {
                 tracing::warn!(
                     "stopped while geometry was at work: its last keyframes are not in the map"
                 );
@@ -384,10 +392,10 @@ fn next_answer(stage: &mut MapStage, answers: &Receiver<Answer>) -> Result<Answe
     }
 }
 
-fn send_news(stage: &mut MapStage, news: Option<&Sender<News>>) {
-    if let Some(news) = news {
+fn send_updates(stage: &mut MapStage, updates: Option<&Sender<KeyframeUpdate>>) {
+    if let Some(updates) = updates {
         // A tracker that is gone is no reason to stop mapping.
-        drop(news.send(stage.map.keyframe_views()));
+        drop(updates.send(stage.keyframe_views()));
     }
 }
 

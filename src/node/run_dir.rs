@@ -13,34 +13,34 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt as log_format};
 
-use crate::config::Settings;
-use crate::eval::comparisons::Comparison;
 use crate::eval::frames::{self, FrameRow, Source as Known};
-use crate::eval::health::write_health;
-use crate::eval::html::{ReportInputs, write_html};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
-use crate::eval::report::{
-    Continued, FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
+use crate::eval::report_json::{
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Resumed, Timing, TrackingFigures,
     percentile,
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
-use crate::export::ply;
-use crate::frame::RgbImage;
-use crate::map::checkpoint;
-use crate::map::layout::map_sha256;
-use crate::memory::peak_rss_mib;
-use crate::node::Outcome;
-use crate::node::track_stage::Tracking;
-use crate::splat::Rendering;
+use crate::machine::memory::peak_rss_mib;
+use crate::node::job::Outcome;
+use crate::node::save_map::{MapFile, SaveError, save_map};
+use crate::node::track_thread::TrackingSummary;
+use crate::params::settings::{Settings, defaults};
+use crate::report::comparisons::Comparison;
+use crate::report::html::{ReportInputs, write_html};
+use crate::report::pose_quality::write_health;
+use splat_engine::error::EngineError;
+use splat_types::image::RgbImage;
+use splat_types::rendering::Rendering;
+use splat_types::splats::layout::map_sha256;
 
 /// Training views whose quality is measured: enough for a mean, few enough for long recordings.
 const MAX_TRAIN_VIEWS: usize = 24;
 /// The same of each kind after a stop, which nobody wants to wait for.
 const MAX_VIEWS_STOPPED: usize = 6;
-/// Pictures in the report.
-const MAX_HELD_OUT_PICTURES: usize = 8;
-const MAX_TRAIN_PICTURES: usize = 4;
+/// Images in the report.
+const MAX_HELD_OUT_IMAGES: usize = 8;
+const MAX_TRAIN_IMAGES: usize = 4;
 
 /// Makes the directory and checks, before any work is done, that it can be written to.
 pub fn prepare(out: &Path) -> anyhow::Result<()> {
@@ -56,11 +56,23 @@ pub fn prepare(out: &Path) -> anyhow::Result<()> {
         })
 }
 
+/// Warnings alone to stderr, for commands whose result is one line.
+pub fn start_warnings() -> anyhow::Result<()> {
+    let is_terminal = std::io::IsTerminal::is_terminal(&std::io::stderr());
+    let layer = log_format::layer()
+        .with_writer(std::io::stderr)
+        .with_ansi(is_terminal)
+        .with_target(false)
+        .with_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn")));
+    let registry = tracing_subscriber::registry().with(layer);
+    registry.try_init().context("the log is already in use")
+}
+
 /// Log lines go to `run.log` and to stderr; a terminal with a progress bar gets warnings only.
 pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
     let filter = |level: &str| {
         EnvFilter::try_from_default_env()
-            .unwrap_or_else(|_| EnvFilter::new(format!("warn,splat_mapper={level}")))
+            .unwrap_or_else(|_| EnvFilter::new(format!("warn,splat_={level}")))
     };
     let stderr = log_format::layer()
         .with_writer(std::io::stderr)
@@ -89,7 +101,7 @@ pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures quality and writes the directory; returns what to tell the user.
+/// Measures quality and writes the directory; returns what to show the user.
 pub fn finish(
     outcome: &mut Outcome,
     settings: &Settings,
@@ -124,7 +136,7 @@ fn write(
 ) -> anyhow::Result<()> {
     let health = outcome.map.health();
     let landmarks = std::mem::take(&mut outcome.tracking.landmarks);
-    let checkpoint = outcome.map.checkpoint(&outcome.snapshot, landmarks);
+    let checkpoint = outcome.map.checkpoint(landmarks);
     let snapshot = &outcome.snapshot;
     let keyframes = timed_keyframes(outcome);
     let frames = frames::trajectory(rows);
@@ -140,6 +152,7 @@ fn write(
     let page = ReportInputs {
         title: input,
         report,
+        defaults: &defaults(),
         comparisons,
         loss: outcome.map.loss_curve(),
         psnr: &[],
@@ -154,12 +167,23 @@ fn write(
         write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
         write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
         frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
-        ply::write(&snapshot.splats, &out.join("map.ply")).map_err(Into::into),
-        checkpoint::write(&checkpoint, &out.join("map.splatmap")).map_err(Into::into),
+        save(MapFile::Ply(&snapshot.splats), &out.join("map.ply")),
+        save(MapFile::Checkpoint(&checkpoint), &out.join("map.splatmap")),
         report.write(&out.join("report.json")).map_err(Into::into),
         write_html(&page, &out.join("report.html")).map_err(Into::into),
     ];
     results.into_iter().collect()
+}
+
+/// A map of an earlier run that stays, since this one has no splats, is no failure of this one's directory.
+fn save(file: MapFile<'_>, path: &Path) -> anyhow::Result<()> {
+    match save_map(file, path) {
+        Err(kept @ SaveError::Empty { .. }) => {
+            tracing::warn!("{kept}");
+            Ok(())
+        }
+        saved => Ok(saved?),
+    }
 }
 
 fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
@@ -177,7 +201,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             selected: outcome.n_selected as u64,
             registered: outcome.own_poses().len() as u64,
             before: outcome.map.continuation().map_or(0, |c| c.keyframes as u64),
-            components: outcome.map.components().len() as u64,
+            submaps: outcome.map.submaps().len() as u64,
         },
         splats: snapshot.splats.len() as u64,
         steps,
@@ -208,7 +232,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
         },
         quality,
         budgets: outcome.map.budgets(),
-        continued: outcome.map.continuation().map(|c| Continued {
+        resume_report: outcome.map.continuation().map(|c| Resumed {
             map_keyframes: c.keyframes as u64,
             asked: c.asked as u64,
             found: c.found as u64,
@@ -217,12 +241,13 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
         scale: snapshot.scale.into(),
         source_fault: outcome.counts.fault.clone(),
         geometry_note: outcome.geometry_note.clone(),
+        engine_faults: outcome.n_engine_faults,
         error: outcome.error.clone(),
         parameters,
     }
 }
 
-/// PSNR over held-out and some training views, and the pictures for the report.
+/// PSNR over held-out and some training views, and the images for the report.
 fn measure_quality(
     outcome: &mut Outcome,
     holdout_every: u32,
@@ -243,17 +268,29 @@ fn measure_quality(
         (usize::MAX, MAX_TRAIN_VIEWS)
     };
     let n_held_out = held_out.len();
-    let (held_out, train) = (thinned(held_out, most_held_out), thinned(train, most_train));
+    let (held_out, train) = (
+        subsampled(held_out, most_held_out),
+        subsampled(train, most_train),
+    );
     if held_out.len() < n_held_out {
         let n = held_out.len();
         tracing::info!("stopped: quality is that of {n} of {n_held_out} held-out views");
     }
-    let mut pictures = Vec::new();
-    let mut measure = |ids: &[u32], is_held_out: bool, max_pictures: usize| {
-        let picture_stride = ids.len().div_ceil(max_pictures).max(1);
+    let mut images = Vec::new();
+    let mut fault: Option<EngineError> = None;
+    let mut measure = |ids: &[u32], is_held_out: bool, max_images: usize| {
+        let image_stride = ids.len().div_ceil(max_images).max(1);
         let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
         for (i, id) in ids.iter().enumerate() {
-            let Some((rendering, photo)) = outcome.map.render_keyframe(*id) else {
+            if fault.is_some() {
+                break;
+            }
+            let shown = outcome.map.render_keyframe(*id);
+            let shown = shown.unwrap_or_else(|error| {
+                fault = Some(error);
+                None
+            });
+            let Some((rendering, photo)) = shown else {
                 continue;
             };
             let psnr = image_metrics::psnr(&rendering.rgb, &photo);
@@ -262,8 +299,8 @@ fn measure_quality(
             if is_held_out {
                 distances.extend(lpips_of(&mut lpips, &rendering, &photo));
             }
-            if i % picture_stride == 0 {
-                pictures.push(Comparison {
+            if i % image_stride == 0 {
+                images.push(Comparison {
                     keyframe_id: *id,
                     held_out: is_held_out,
                     photo,
@@ -277,9 +314,14 @@ fn measure_quality(
         let distance = mean(&distances).filter(|_| is_whole);
         (mean(&psnrs), mean(&ssims), distance)
     };
-    let (psnr_holdout, ssim_holdout, lpips_holdout) =
-        measure(&held_out, true, MAX_HELD_OUT_PICTURES);
-    let (psnr_train, ..) = measure(&train, false, MAX_TRAIN_PICTURES);
+    let (psnr_holdout, ssim_holdout, lpips_holdout) = measure(&held_out, true, MAX_HELD_OUT_IMAGES);
+    let (psnr_train, ..) = measure(&train, false, MAX_TRAIN_IMAGES);
+    if let Some(error) = fault {
+        tracing::error!("engine: {error}; quality is not measured");
+        // Of a run that has failed before, the first reason counts.
+        outcome.error.get_or_insert(format!("engine: {error}"));
+        return (Quality::default(), Vec::new());
+    }
     let quality = Quality {
         holdout_every: u64::from(holdout_every),
         psnr_train,
@@ -287,11 +329,11 @@ fn measure_quality(
         ssim_holdout,
         lpips_holdout,
     };
-    (quality, pictures)
+    (quality, images)
 }
 
 /// Evenly, at most so many.
-fn thinned(ids: Vec<u32>, most: usize) -> Vec<u32> {
+fn subsampled(ids: Vec<u32>, most: usize) -> Vec<u32> {
     let stride = ids.len().div_ceil(most).max(1);
     ids.into_iter().step_by(stride).collect()
 }
@@ -313,15 +355,15 @@ fn mean(values: &[f64]) -> Option<f64> {
 
 /// Of this run: those of a saved map have stamps of another recording.
 fn timed_keyframes(outcome: &Outcome) -> Vec<TimedPose> {
-    let timed = |pose: &crate::map::snapshot::KeyframePose| TimedPose {
+    let timed = |pose: &splat_types::snapshot::KeyframePose| TimedPose {
         stamp: pose.stamp,
-        pose: pose.map_from_cam,
+        pose: pose.world_from_cam,
     };
     outcome.own_poses().iter().map(timed).collect()
 }
 
 /// `rows` are those of the same run.
-pub(super) fn tracking_figures(tracking: &Tracking, rows: &[FrameRow]) -> TrackingFigures {
+pub(crate) fn tracking_figures(tracking: &TrackingSummary, rows: &[FrameRow]) -> TrackingFigures {
     let n_known = |wanted: &[Known]| {
         let found = rows.iter().filter(|row| wanted.contains(&row.source));
         found.count() as u64
@@ -352,10 +394,10 @@ fn summary(report: &Report, out: Option<&Path>) -> String {
         .map(|out| format!(": {}", out.join("report.html").display()))
         .unwrap_or_default();
     format!(
-        "{} of {} keyframes in {} component(s), {} splats, {} steps in {:.0} s{quality}{place}",
+        "{} of {} keyframes in {} submap(s), {} splats, {} steps in {:.0} s{quality}{place}",
         keyframes.registered,
         keyframes.selected,
-        keyframes.components,
+        keyframes.submaps,
         report.splats,
         report.steps,
         report.timing_s.wall

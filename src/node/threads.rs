@@ -5,27 +5,27 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 
-use crate::frame::{Batch, Frame};
-use crate::geometry::GeometryBatch;
-use crate::node::pace::Pace;
-use crate::node::source_stage::SourceStage;
-use crate::node::stages::SelectStage;
-use crate::node::track_stage::{Heard, tell};
-use crate::queue::{Received, Receiver, Sender};
+use crate::node::backpressure::Backpressure;
+use crate::node::map_stage::SelectStage;
+use crate::node::source_thread::SourceStage;
+use crate::node::track_thread::{TrackerInput, report};
+use splat_geometry::answer::GeometryBatch;
+use splat_io::queue::{Received, Receiver, Sender};
+use splat_types::frame::{Batch, Frame};
 
 /// Live, while no frame comes: time between looks at whether geometry stands idle.
 const LIVE_TICK: Duration = Duration::from_millis(50);
 
 /// What crosses from geometry to the map; no batch at the model's end.
-pub(super) type Answer = (Option<Arc<Batch>>, GeometryBatch);
+pub(crate) type Answer = (Option<Arc<Batch>>, GeometryBatch);
 
-pub(super) fn run_source(
+pub(crate) fn run_source(
     mut stage: SourceStage,
     frames: &Sender<Frame>,
-    heard: Option<&Sender<Heard>>,
+    received: Option<&Sender<TrackerInput>>,
 ) -> (SourceStage, u64) {
     while let Some(frame) = stage.next() {
-        tell(heard, &frame);
+        report(received, &frame);
         if frames.send(frame).is_err() {
             break;
         }
@@ -34,26 +34,26 @@ pub(super) fn run_source(
 }
 
 /// Live where there is a pace.
-pub(super) fn run_select(
+pub(crate) fn run_select(
     mut stage: SelectStage,
     frames: &Receiver<Frame>,
     batches: &Sender<Arc<Batch>>,
-    heard: Option<&Sender<Heard>>,
-    pace: Option<&Pace>,
+    received: Option<&Sender<TrackerInput>>,
+    backpressure: Option<&Backpressure>,
 ) -> SelectStage {
-    if let Some(pace) = pace {
-        return run_select_live(stage, frames, batches, pace);
+    if let Some(backpressure) = backpressure {
+        return run_select_live(stage, frames, batches, backpressure);
     }
-    // The tracker hears of a batch before geometry does: news of a batch can always be taken, so that nobody waits in
+    // The tracker receives of a batch before geometry does: updates of a batch can always be taken, so that nobody waits in
     // a circle.
     let send = |batch: Batch| {
-        if let Some(heard) = heard {
-            drop(heard.send(Heard::Batch));
+        if let Some(received) = received {
+            drop(received.send(TrackerInput::Batch));
         }
         batches.send(Arc::new(batch)).is_ok()
     };
     while let Some(frame) = frames.recv() {
-        tell(heard, &frame);
+        report(received, &frame);
         if let Some(batch) = stage.push(frame)
             && !send(batch)
         {
@@ -71,7 +71,7 @@ fn run_select_live(
     mut stage: SelectStage,
     frames: &Receiver<Frame>,
     batches: &Sender<Arc<Batch>>,
-    pace: &Pace,
+    backpressure: &Backpressure,
 ) -> SelectStage {
     loop {
         let full = match frames.recv_timeout(LIVE_TICK) {
@@ -80,11 +80,11 @@ fn run_select_live(
             Received::Ended => break,
         };
         let batch = match full {
-            None if pace.is_due(stage.n_new()) => stage.finish(),
+            None if backpressure.is_due(stage.n_new()) => stage.finish(),
             full => full,
         };
         if let Some(batch) = batch
-            && !(pace.wait_to_send() && batches.send(Arc::new(batch)).is_ok())
+            && !(backpressure.wait_to_send() && batches.send(Arc::new(batch)).is_ok())
         {
             return stage;
         }
@@ -97,7 +97,7 @@ fn run_select_live(
 
 /// Live, parallel loops of geometry must not wait behind those of the map in the pool that all share: threads of their
 /// own get their part of the processors from the system.
-pub(super) fn in_own_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+pub(crate) fn in_own_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let named = |ix: usize| format!("geometry-{ix}");
     match rayon::ThreadPoolBuilder::new().thread_name(named).build() {
         Ok(pool) => pool.install(work),
@@ -108,7 +108,7 @@ pub(super) fn in_own_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     }
 }
 
-pub(super) fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
+pub(crate) fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {
     thread.join().map_err(|panic| {
         let text = panic.downcast_ref::<String>().cloned();
         let text = text.or_else(|| panic.downcast_ref::<&str>().map(|t| (*t).to_owned()));

@@ -1,33 +1,36 @@
-//! What comes after a foundation model's answer, measured with the stated noise on real and made-up scenes.
+//! What comes after a foundation model's answer, measured with the stated noise on real and synthetic scenes.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::Stopwatch;
-use splat_mapper::config::align::{AlignMethod, AlignParams, JoinBy};
-use splat_mapper::config::{Params, Settings};
-use splat_mapper::eval::align::align;
-use splat_mapper::eval::evaluation::compare;
-use splat_mapper::eval::trajectory::read_tum;
-use splat_mapper::frame::{Batch, Frame, Keyframe, RgbImage};
-use splat_mapper::geometry::align::noise::{Noise, answer};
-use splat_mapper::geometry::align::{Aligner, Given};
-use splat_mapper::geometry::known::Known;
-use splat_mapper::geometry::{GeometryModel as _, Health, Revision, View};
-use splat_mapper::pose::Rigid;
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
-
 use crate::scenes::scene;
 use crate::sfm::shown;
+use splat_geometry::alignment::aligner::Aligner;
+use splat_geometry::alignment::matched::InitialPoses;
+use splat_geometry::alignment::params::{AlignMethod, AlignParams, Registration};
+use splat_geometry::answer::{PoseQuality, PoseUpdate, View};
+use splat_geometry::ground_truth::model::GroundTruthModel;
+use splat_geometry::ground_truth::noise::{Noise, answer};
+use splat_geometry::model::GeometryModel as _;
+use splat_mapper::eval::alignment::align;
+use splat_mapper::eval::evaluation::compare;
+use splat_mapper::eval::trajectory::read_tum;
+use splat_mapper::params::params::Params;
+use splat_mapper::params::settings::Settings;
+use splat_synth::settings::{SceneKind, SynthSettings};
+use splat_synth::take::Take;
+use splat_types::camera::Intrinsics;
+use splat_types::frame::{Batch, Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::time::Stopwatch;
+use splat_types::transform::Rigid;
 
 /// Asked for: median epipolar error after, and pose error after over before.
 const MAX_AFTER_PX: f64 = 1.0;
 const MAX_LEFT: f64 = 0.4;
 /// Of the extent, as the alignment leaves it.
 const MAX_ATE_PERCENT: f64 = 0.3;
-/// Of the error of place that windows leave, when their component was corrected as a whole.
+/// Of the error of place that windows leave, when their submap was corrected as a whole.
 const MAX_LEFT_WHOLE: f64 = 0.85;
 /// Set, the tests measure every figure of docs/ALIGNMENT.md, which takes a quarter of an hour.
 const ALL_FIGURES: &str = "SPLAT_MAPPER_ALL_FIGURES";
@@ -40,10 +43,10 @@ fn params() -> Params {
     Settings::shipped().params().unwrap()
 }
 
-/// True views with their pictures.
+/// True views with their images.
 struct Filmed {
     views: Vec<View>,
-    pictures: BTreeMap<u32, Arc<RgbImage>>,
+    images: BTreeMap<u32, Arc<RgbImage>>,
 }
 
 fn film(kind: SceneKind, frames: impl Iterator<Item = u32>) -> Filmed {
@@ -56,21 +59,19 @@ fn film(kind: SceneKind, frames: impl Iterator<Item = u32>) -> Filmed {
     let take = Take::new(settings).unwrap();
     let mut filmed = Filmed {
         views: Vec::new(),
-        pictures: BTreeMap::new(),
+        images: BTreeMap::new(),
     };
     for ix in frames {
         let keyframe_id = filmed.views.len() as u32;
-        filmed
-            .pictures
-            .insert(keyframe_id, Arc::new(take.picture(ix)));
+        filmed.images.insert(keyframe_id, Arc::new(take.image(ix)));
         filmed.views.push(View {
             keyframe_id,
-            component: 0,
+            submap: 0,
             intrinsics: lens,
             lens: None,
-            batch_from_cam: take.pose(ix),
+            submap_from_cam: take.pose(ix),
             depth: take.depth(ix, &lens.resized(160, 120)),
-            health: Health::default(),
+            health: PoseQuality::default(),
         });
     }
     filmed
@@ -80,7 +81,8 @@ fn film(kind: SceneKind, frames: impl Iterator<Item = u32>) -> Filmed {
 fn fox() -> Option<Filmed> {
     let shown = shown(&scene("fox")?, 640, 1, true);
     let params = params();
-    let mut known = Known::new(params.known, (&params.sfm, &params.mvs), None, 0).unwrap();
+    let mut known =
+        GroundTruthModel::new(params.ground_truth, (&params.sfm, &params.mvs), None, 0).unwrap();
     let keyframes: Vec<Arc<Keyframe>> = (shown.keyframes.iter().zip(&shown.truth))
         .take(12)
         .map(|(k, truth)| {
@@ -94,40 +96,43 @@ fn fox() -> Option<Filmed> {
             })
         })
         .collect();
-    let pictures = keyframes.iter().map(|k| (k.id, Arc::clone(&k.frame.image)));
-    let pictures = pictures.collect();
+    let images = keyframes.iter().map(|k| (k.id, Arc::clone(&k.frame.image)));
+    let images = images.collect();
     let batch = Batch {
         id: 0,
         n_shared: 0,
         keyframes,
     };
     let views = known.infer(&batch).unwrap().views;
-    Some(Filmed { views, pictures })
+    Some(Filmed { views, images })
 }
 
-/// Root mean square of place after the best similarity, and of heading in degrees after the best turn.
+/// Root mean square of place after the best similarity, and of orientation in degrees after the best turn.
 fn pose_error(found: &[View], truth: &[View]) -> (f64, f64) {
     let poses = |views: &[View]| {
         views
             .iter()
-            .map(|v| v.batch_from_cam)
+            .map(|v| v.submap_from_cam)
             .collect::<Vec<Rigid>>()
     };
     let (found, truth) = (poses(found), poses(truth));
     let similarity = align(&found, &truth).unwrap().reference_from_estimate;
     let pairs: Vec<(Rigid, Rigid)> = truth.iter().copied().zip(found.iter().copied()).collect();
-    // Places of a short path say little of its turn, and headings enough.
-    let turn = splat_mapper::map::align::align(&pairs).unwrap();
+    // Places of a short path say little of its turn, and orientations enough.
+    let turn = splat_geometry::similarity::of_poses(&pairs).unwrap();
     let root_mean = |squares: Vec<f64>| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
     let places = pairs.iter().map(|(exact, pose)| {
         let laid = similarity.transform_pose(pose);
         laid.translation.distance_squared(exact.translation)
     });
-    let headings = pairs.iter().map(|(exact, pose)| {
+    let orientations = pairs.iter().map(|(exact, pose)| {
         let angle = turn.transform_pose(pose).angle_to(exact).to_degrees();
         angle * angle
     });
-    (root_mean(places.collect()), root_mean(headings.collect()))
+    (
+        root_mean(places.collect()),
+        root_mean(orientations.collect()),
+    )
 }
 
 /// Median relative depth error after the best common factor, as a share.
@@ -170,7 +175,7 @@ fn corrected(filmed: &Filmed, params: &AlignParams) -> Sums {
         let mut aligner = Aligner::new(params, &self::params().sfm, 1).unwrap();
         let before = pose_error(&views, truth);
         sums.depth_before += share * depth_error(&views, truth);
-        let refined = aligner.refine(&mut views, &filmed.pictures, Given::default());
+        let refined = aligner.refine(&mut views, &filmed.images, InitialPoses::default());
         let after = pose_error(&views, truth);
         sums.depth_after += share * depth_error(&views, truth);
         sums.before_px += share * refined.before_px.unwrap();
@@ -244,18 +249,18 @@ fn laid(
         keyframe_id: id,
         ..filmed.views[id as usize % lap].clone()
     };
-    let revise = |found: &mut BTreeMap<u32, View>, revised: Vec<Revision>| {
-        for news in revised {
-            let view = found.get_mut(&news.keyframe_id).unwrap();
-            view.batch_from_cam = news.batch_from_cam;
+    let revise = |found: &mut BTreeMap<u32, View>, revised: Vec<PoseUpdate>| {
+        for update in revised {
+            let view = found.get_mut(&update.keyframe_id).unwrap();
+            view.submap_from_cam = update.submap_from_cam;
         }
     };
     for window in 0..n {
         let ids = 6 * window..6 * window + 8;
         let truths: Vec<View> = ids.clone().map(truth).collect();
         let views = answer(&truths, &Noise::STATED, u64::from(window));
-        let picture = |id: u32| (id, Arc::clone(&filmed.pictures[&(id % lap as u32)]));
-        let joined = aligner.place(views, &ids.map(picture).collect(), true);
+        let image = |id: u32| (id, Arc::clone(&filmed.images[&(id % lap as u32)]));
+        let joined = aligner.place(views, &ids.map(image).collect(), true);
         for view in joined.views {
             found.entry(view.keyframe_id).or_insert(view);
         }
@@ -268,66 +273,66 @@ fn laid(
         .unzip()
 }
 
-/// Where windows end: error of the last place and largest error, over the length of the path, and components. The
-/// frame is that of the first window. Round after round the camera sees the same pictures; nothing in windows reaches that
+/// Where windows end: error of the last place and largest error, over the length of the path, and submaps. The
+/// frame is that of the first window. Round after round the camera sees the same images; nothing in windows reaches that
 /// far back.
 fn drift(filmed: &Filmed, n: u32, params: &AlignParams) -> (f64, f64, u32) {
     let windows_only = AlignParams {
-        whole: 0,
+        global_ba_keyframes: 0,
         ..params.clone()
     };
     let (truths, found) = laid(filmed, n, &windows_only, 400);
     let pairs: Vec<(Rigid, Rigid)> = truths
         .iter()
         .zip(&found)
-        .map(|(exact, v)| (exact.batch_from_cam, v.batch_from_cam))
+        .map(|(exact, v)| (exact.submap_from_cam, v.submap_from_cam))
         .collect();
     let steps = pairs.windows(2);
     let path: f64 = steps
         .map(|two| two[0].0.translation.distance(two[1].0.translation))
         .sum();
-    let similarity = splat_mapper::map::align::align(&pairs[..8]).unwrap();
+    let similarity = splat_geometry::similarity::of_poses(&pairs[..8]).unwrap();
     let off = |(exact, pose): &(Rigid, Rigid)| {
         let laid = similarity.transform_pose(pose);
         laid.translation.distance(exact.translation)
     };
     let worst = pairs.iter().map(off).fold(0.0, f64::max);
     let last = off(pairs.last().unwrap());
-    let components = found.iter().map(|v| v.component).max().unwrap() + 1;
-    (last / path, worst / path, components)
+    let submaps = found.iter().map(|v| v.submap).max().unwrap() + 1;
+    (last / path, worst / path, submaps)
 }
 
 fn check_drift(kind: SceneKind) {
     let filmed = film(kind, (0..120).step_by(2));
     let base = params().align;
-    let mut ways = vec![(base.method, base.join, base.history)];
+    let mut ways = vec![(base.method, base.registration, base.fixed_keyframes)];
     // Figures of docs/ALIGNMENT.md.
     if std::env::var_os(ALL_FIGURES).is_some() {
         ways.extend([
-            (base.method, JoinBy::Poses, 0),
-            (base.method, JoinBy::Points, 0),
-            (base.method, JoinBy::Points, 6),
-            (base.method, JoinBy::Poses, 12),
-            (AlignMethod::Epipolar, JoinBy::Poses, 6),
-            (AlignMethod::Off, JoinBy::Poses, 0),
-            (AlignMethod::Off, JoinBy::Points, 0),
+            (base.method, Registration::Poses, 0),
+            (base.method, Registration::Points, 0),
+            (base.method, Registration::Points, 6),
+            (base.method, Registration::Poses, 12),
+            (AlignMethod::Epipolar, Registration::Poses, 6),
+            (AlignMethod::Off, Registration::Poses, 0),
+            (AlignMethod::Off, Registration::Points, 0),
         ]);
     }
-    for (ix, (method, join, history)) in ways.into_iter().enumerate() {
+    for (ix, (method, registration, fixed_keyframes)) in ways.into_iter().enumerate() {
         let params = AlignParams {
             method,
-            join,
-            history,
+            registration,
+            fixed_keyframes,
             ..base.clone()
         };
-        let (last, worst, components) = drift(&filmed, 100, &params);
+        let (last, worst, submaps) = drift(&filmed, 100, &params);
         let (last, worst) = (100.0 * last, 100.0 * worst);
         eprintln!(
-            "{kind:?} {method:?} {join:?} {history}: last {last:.3} %, worst {worst:.3} %, {components} components"
+            "{kind:?} {method:?} {registration:?} {fixed_keyframes}: last {last:.3} %, worst {worst:.3} %, {submaps} submaps"
         );
         if ix == 0 {
             assert!(
-                last < 100.0 * MAX_DRIFT && components == 1,
+                last < 100.0 * MAX_DRIFT && submaps == 1,
                 "{kind:?}: {last:.3} %"
             );
         }
@@ -343,18 +348,18 @@ fn a_hundred_windows_of_a_facade_drift_by_less_than_a_percent_of_the_path() {
 }
 
 #[test]
-fn a_component_that_is_corrected_as_a_whole_ends_nearer_the_truth() {
+fn a_submap_that_is_corrected_as_a_whole_ends_nearer_the_truth() {
     let filmed = film(SceneKind::Corridor, (0..88).step_by(2));
     let base = params().align;
     let error = |whole: usize| {
         let params = AlignParams {
-            whole,
+            global_ba_keyframes: whole,
             ..base.clone()
         };
         let (truths, found) = laid(&filmed, 7, &params, 1200);
         pose_error(&found, &truths)
     };
-    let (windows, whole, some) = (error(0), error(base.whole), error(20));
+    let (windows, whole, some) = (error(0), error(base.global_ba_keyframes), error(20));
     eprintln!("corridor: windows {windows:.4?}, whole {whole:.4?}, the newest 20 {some:.4?}");
     assert!(whole.0 < MAX_LEFT_WHOLE * windows.0, "place");
     assert!(whole.1 < MAX_LEFT_WHOLE * windows.1, "heading");
@@ -369,7 +374,7 @@ fn a_replay_of_noisy_windows_ends_near_the_truth() {
     let room = "synthetic:room?frames=40&width=320&height=240&speed=2";
     let run = |to: &str, more: &[&str]| {
         let output = std::process::Command::new(env!("CARGO_BIN_EXE_splat-mapper"))
-            .args(["replay", room, "--out", to, "--geometry", "known"])
+            .args(["replay", room, "--out", to, "--geometry", "ground_truth"])
             .args(["--set", "select.batch_overlap=2"])
             .args(more)
             .output()
@@ -379,11 +384,11 @@ fn a_replay_of_noisy_windows_ends_near_the_truth() {
         read_tum(&std::path::Path::new(to).join("keyframes.tum")).unwrap()
     };
     let noise = [
-        "known.windows=true",
-        "known.rotation_noise_deg=1",
-        "known.translation_noise=0.02",
-        "known.depth_noise=0.05",
-        "known.depth_outliers=0.05",
+        "ground_truth.windows=true",
+        "ground_truth.rotation_noise_deg=1",
+        "ground_truth.translation_noise=0.02",
+        "ground_truth.depth_noise=0.05",
+        "ground_truth.depth_outliers=0.05",
     ];
     let mut more = vec!["--steps", "0"];
     noise.iter().for_each(|set| more.extend(["--set", set]));

@@ -6,8 +6,9 @@ use std::io::Cursor;
 use mcap::records::MessageHeader;
 use mcap::{Compression, WriteOptions, Writer};
 use serde::Serialize;
-use splat_mapper::clock::Stamp;
-use splat_mapper::ros::{self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped};
+
+use splat_msgs::ros::{self, CameraInfo, CompressedImage, Header, Image, Message, PoseStamped};
+use splat_types::time::Stamp;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Endian {
@@ -135,11 +136,9 @@ pub fn image(stamp: Stamp, encoding: &str, (width, height): (u32, u32), data: Ve
 }
 
 pub fn png(stamp: Stamp, size: (u32, u32), rgb: &[u8]) -> CompressedImage {
-    let picture = image::RgbImage::from_raw(size.0, size.1, rgb.to_vec()).unwrap();
+    let image = image::RgbImage::from_raw(size.0, size.1, rgb.to_vec()).unwrap();
     let mut data = Cursor::new(Vec::new());
-    picture
-        .write_to(&mut data, image::ImageFormat::Png)
-        .unwrap();
+    image.write_to(&mut data, image::ImageFormat::Png).unwrap();
     CompressedImage {
         header: header(stamp),
         format: "rgb8; png compressed bgr8".to_owned(),
@@ -160,7 +159,7 @@ pub fn jpeg(stamp: Stamp, size: (u32, u32), rgb: &[u8]) -> CompressedImage {
     }
 }
 
-/// Focal length 100 px, the middle of the picture as principal point.
+/// Focal length 100 px, the middle of the image as principal point.
 pub fn camera_info((width, height): (u32, u32), model: &str, d: &[f64]) -> CameraInfo {
     let (cx, cy) = (f64::from(width) / 2.0 - 0.5, f64::from(height) / 2.0 - 0.5);
     CameraInfo {

@@ -2,22 +2,24 @@
 
 use std::sync::Arc;
 
-use splat_mapper::clock::Stopwatch;
-use splat_mapper::config::{MapParams, Settings};
-use splat_mapper::eval::image_metrics::psnr;
-use splat_mapper::frame::{Batch, Keyframe};
-use splat_mapper::geometry::GeometryModel;
-use splat_mapper::geometry::known::Known;
-use splat_mapper::map::SplatMap;
-use splat_mapper::map::checkpoint;
-use splat_mapper::map::schedule::Phase;
-use splat_mapper::map::snapshot::Scale;
-use splat_mapper::source::Source;
-use splat_mapper::source::synthetic::endless::EndlessSource;
-use splat_mapper::splat::Engine;
-use splat_mapper::splat::cpu::CpuEngine;
-
 use crate::gpu_runs::gpu_engine;
+use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::traits::Engine;
+use splat_geometry::ground_truth::model::GroundTruthModel;
+use splat_geometry::model::GeometryModel;
+use splat_io::frame_source::Source;
+use splat_mapper::eval::image_metrics::psnr;
+use splat_mapper::node::page_file::PageFile;
+use splat_mapper::node::save_map::{MapFile, save_map};
+use splat_mapper::params::settings::Settings;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_slam::mapper::mapper::Mapper;
+use splat_slam::mapper::params::{MapParams, MapperParams, McmcParams, TrainParams};
+use splat_slam::mapper::train::schedule::Phase;
+use splat_synth::endless::EndlessSource;
+use splat_types::frame::{Batch, Keyframe};
+use splat_types::snapshot::Scale;
+use splat_types::time::Stopwatch;
 
 const MAX_SPLATS: usize = 3000;
 const MAX_KEYFRAMES: usize = 48;
@@ -26,37 +28,50 @@ const BATCH: usize = 10;
 const CORRIDOR: &str = "endless?frames=2000&turn=1000&width=64&height=48";
 const STEPS_PER_BATCH: u64 = 20;
 
-fn params() -> MapParams {
-    MapParams {
-        max_splats: MAX_SPLATS,
-        max_keyframes_in_ram: MAX_KEYFRAMES,
-        seeds_per_keyframe: 150,
-        holdout: 0,
-        max_side: 64,
-        ..Settings::shipped().params().unwrap().map
+fn params() -> MapperParams {
+    MapperParams {
+        map: MapParams {
+            max_splats: MAX_SPLATS,
+            max_resident_keyframes: MAX_KEYFRAMES,
+            holdout: 0,
+            ..MapParams::default()
+        },
+        train: TrainParams {
+            seeds_per_keyframe: 150,
+            max_side: 64,
+            ..TrainParams::default()
+        },
+        mcmc: McmcParams::default(),
     }
 }
 
 struct Walk {
     source: EndlessSource,
-    model: Known,
-    map: SplatMap,
+    model: GroundTruthModel,
+    map: Mapper,
     next_id: u32,
     batch_id: u32,
 }
 
+/// A page file as the node makes it.
+fn pages(params: &MapperParams) -> Box<PageFile> {
+    Box::new(PageFile::new(None, params.map.max_page_file_mib << 20))
+}
+
 impl Walk {
-    fn new(corridor: &str, params: MapParams) -> Self {
+    fn new(corridor: &str, params: MapperParams) -> Self {
         Self::on(Box::new(CpuEngine::new()), corridor, params)
     }
 
-    fn on(engine: Box<dyn Engine>, corridor: &str, params: MapParams) -> Self {
+    fn on(engine: Box<dyn Engine>, corridor: &str, params: MapperParams) -> Self {
         let all = Settings::shipped().params().unwrap();
-        let model = Known::new(all.known, (&all.sfm, &all.mvs), Some(1.0), 7).unwrap();
+        let model =
+            GroundTruthModel::new(all.ground_truth, (&all.sfm, &all.mvs), Some(1.0), 7).unwrap();
+        let pages = pages(&params);
         Self {
             source: EndlessSource::open(corridor).unwrap(),
             model,
-            map: SplatMap::new(params, 3, Scale::GIVEN, engine),
+            map: Mapper::new(params, 3, Scale::GIVEN, engine).paging_to(pages),
             next_id: 0,
             batch_id: 0,
         }
@@ -89,15 +104,15 @@ impl Walk {
         };
         self.batch_id += 1;
         let geometry = self.model.infer(&batch).unwrap();
-        self.map.add(Some(&batch), geometry, None);
-        self.map.step(STEPS_PER_BATCH, Phase::Streaming);
+        self.map.add(Some(&batch), &geometry, None).unwrap();
+        self.map.step(STEPS_PER_BATCH, Phase::Streaming).unwrap();
         true
     }
 
     fn quality(&mut self, ids: std::ops::Range<u32>) -> f64 {
         let n = ids.len() as f64;
         let of = |id| {
-            let (shown, photo) = self.map.render_keyframe(id).unwrap();
+            let (shown, photo) = self.map.render_keyframe(id).unwrap().unwrap();
             psnr(&shown.rgb, &photo)
         };
         ids.map(of).sum::<f64>() / n
@@ -128,14 +143,16 @@ fn two_thousand_keyframes_stay_within_their_budgets_and_come_back() {
     eprintln!("{budgets:?}");
     assert!(budgets.peak_splats <= MAX_SPLATS as u64 && most > MAX_SPLATS / 2);
     assert!(budgets.peak_keyframes_in_ram <= MAX_KEYFRAMES as u64);
-    assert!(budgets.restored_splats > 0 && budgets.pictures_lost == 0);
+    assert!(budgets.restored_splats > 0 && budgets.images_lost == 0);
     let after = walk.quality(20..40);
     eprintln!("{before:.2} dB before they left, {after:.2} dB when they were back");
     assert!(after > before - 1.0);
 
     // The file has what memory has not.
     let path = folder.path().join("map.splatmap");
-    walk.map.save(Vec::new(), &path).unwrap();
+    walk.map.snapshot().unwrap();
+    let whole = walk.map.checkpoint(Vec::new());
+    save_map(MapFile::Checkpoint(&whole), &path).unwrap();
     let back = checkpoint::read(&path).unwrap();
     let in_all = walk.map.n_splats() as u64 + budgets.splats_on_disk;
     assert_eq!(back.snapshot.splats.len() as u64, in_all);
@@ -148,8 +165,9 @@ fn two_thousand_keyframes_stay_within_their_budgets_and_come_back() {
 fn check_load(saved: checkpoint::Checkpoint) {
     let in_all = saved.snapshot.splats.len() as u64;
     let track = Settings::shipped().params().unwrap().track;
-    let map = SplatMap::new(params(), 3, Scale::GIVEN, Box::new(CpuEngine::new()));
-    let map = map.continued(saved, &track).unwrap();
+    let map = Mapper::new(params(), 3, Scale::GIVEN, Box::new(CpuEngine::new()))
+        .paging_to(pages(&params()));
+    let map = map.resume_report(saved, &track).unwrap();
     let budgets = map.budgets();
     assert!(map.n_splats() <= MAX_SPLATS);
     assert_eq!(map.n_splats() as u64 + budgets.splats_on_disk, in_all);
@@ -158,13 +176,14 @@ fn check_load(saved: checkpoint::Checkpoint) {
 
 #[test]
 fn moves_of_splats_keep_to_the_cap_as_well() {
-    let growing = MapParams {
-        mcmc: true,
-        mcmc_start: 10,
-        mcmc_every: 10,
+    let mut growing = params();
+    growing.map.max_splats = 1000;
+    growing.mcmc = McmcParams {
+        enabled: true,
+        start: 10,
+        every: 10,
         growth: 1.5,
-        max_splats: 1000,
-        ..params()
+        ..McmcParams::default()
     };
     let mut walk = Walk::new("endless?frames=300&width=48&height=36", growing);
     while walk.go() {
@@ -179,13 +198,11 @@ fn moves_of_splats_keep_to_the_cap_as_well() {
 
 #[test]
 fn the_engine_stays_within_its_bytes() {
-    let small = MapParams {
-        max_gpu_mib: 1,
-        max_splats: 1_000_000,
-        seeds_per_keyframe: 400,
-        max_keyframes_in_ram: 0,
-        ..params()
-    };
+    let mut small = params();
+    small.map.max_gpu_mib = 1;
+    small.map.max_splats = 1_000_000;
+    small.map.max_resident_keyframes = 0;
+    small.train.seeds_per_keyframe = 400;
     let mut walk = Walk::new("endless?frames=200&width=64&height=48", small);
     while walk.go() {}
     let budgets = walk.map.budgets();
@@ -196,17 +213,15 @@ fn the_engine_stays_within_its_bytes() {
 }
 
 #[test]
-fn on_a_gpu_splats_and_pictures_leave_and_come_back_as_well() {
-    let small = MapParams {
-        max_gpu_mib: 16,
-        max_splats: 500,
-        seeds_per_keyframe: 60,
-        max_keyframes_in_ram: 12,
-        max_side: 48,
-        ..params()
-    };
+fn on_a_gpu_splats_and_images_leave_and_come_back_as_well() {
+    let mut small = params();
+    small.map.max_gpu_mib = 16;
+    small.map.max_splats = 500;
+    small.map.max_resident_keyframes = 12;
+    small.train.seeds_per_keyframe = 60;
+    small.train.max_side = 48;
     let corridor = "endless?frames=400&turn=200&width=48&height=36";
-    let mut walk = Walk::on(Box::new(gpu_engine(true)), corridor, small);
+    let mut walk = Walk::on(Box::new(gpu_engine()), corridor, small);
     let mut before = 0.0;
     while walk.go() {
         assert!(walk.map.n_splats() <= 500);
@@ -217,7 +232,6 @@ fn on_a_gpu_splats_and_pictures_leave_and_come_back_as_well() {
     let budgets = walk.map.budgets();
     let after = walk.quality(5..15);
     eprintln!("{budgets:?}; {before:.2} dB, then {after:.2} dB");
-    assert_eq!(walk.map.fault(), None);
     assert!(budgets.peak_engine_mib <= 16.0 * 1.05, "{budgets:?}");
     assert!(
         budgets.evicted_splats > 0 && budgets.restored_splats > 0,

@@ -4,20 +4,21 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use splat_mapper::clock::{Stamp, Stopwatch, monotonic_nanos};
-use splat_mapper::frame::RgbImage;
-use splat_mapper::source::camera::live::Opener;
-use splat_mapper::source::camera::stamps::ClockReading;
-use splat_mapper::source::camera::{Camera, CameraError, Coding, Layout, Shot};
-use splat_mapper::source::pixels::{PixelFormat, YuvColour};
+use splat_image::pixel_format::{PixelFormat, YuvColour};
+use splat_io::camera::driver::{Camera, CapturedImage, Coding, Layout};
+use splat_io::camera::live::Opener;
+use splat_io::camera::stamps::ClockReading;
+use splat_io::camera_error::CameraError;
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch, monotonic_nanos};
 
 const PACE: Duration = Duration::from_millis(10);
 
 /// What the camera does next.
 #[derive(Debug, Clone)]
 pub enum Step {
-    /// A picture; without bytes the camera's plain one.
-    Picture {
+    /// An image; without bytes the camera's plain one.
+    Image {
         sequence: u32,
         /// Before it is handed out.
         age_nanos: i64,
@@ -26,12 +27,12 @@ pub enum Step {
     },
     /// The read fails, and opening again does for so long.
     Unplugged { secs: f64 },
-    /// No picture for ever, until it is opened again.
+    /// No image for ever, until it is opened again.
     Hang,
 }
 
-pub fn picture(sequence: u32) -> Step {
-    Step::Picture {
+pub fn test_image(sequence: u32) -> Step {
+    Step::Image {
         sequence,
         age_nanos: 0,
         is_damaged: false,
@@ -49,7 +50,7 @@ struct Stage {
     clock: Clock,
 }
 
-/// `Real`, or one that stands at the time of the newest picture.
+/// `Real`, or one that stands at the time of the newest image.
 #[derive(Debug, Clone, Copy)]
 pub enum Clock {
     Real,
@@ -121,7 +122,7 @@ impl Camera for Scripted {
         self.script.layout
     }
 
-    fn next(&mut self, wait: Duration) -> Result<Option<Shot<'_>>, CameraError> {
+    fn next(&mut self, wait: Duration) -> Result<Option<CapturedImage<'_>>, CameraError> {
         let mut stage = self.script.stage.lock().unwrap();
         if self.is_hanging || stage.steps.is_empty() {
             drop(stage);
@@ -129,7 +130,7 @@ impl Camera for Scripted {
             return Ok(None);
         }
         match stage.steps.pop_front().unwrap() {
-            Step::Picture {
+            Step::Image {
                 sequence,
                 age_nanos,
                 is_damaged,
@@ -145,7 +146,7 @@ impl Camera for Scripted {
                 if let Some(bytes) = bytes {
                     self.bytes = bytes;
                 }
-                Ok(Some(Shot {
+                Ok(Some(CapturedImage {
                     bytes: &self.bytes,
                     sequence: Some(sequence),
                     taken_nanos: Some(now.after_nanos - age_nanos),
@@ -196,18 +197,18 @@ pub fn layout(format: PixelFormat, (width_px, height_px): (u32, u32)) -> Layout 
     }
 }
 
-/// Pictures as a camera with RGB pixels sends them, `unplugged` for a while before the one of that number.
-pub fn steps_of(pictures: &[RgbImage], unplugged: Option<usize>) -> Vec<Step> {
+/// Images as a camera with RGB pixels sends them, `unplugged` for a while before the one of that number.
+pub fn steps_of(images: &[RgbImage], unplugged: Option<usize>) -> Vec<Step> {
     let mut steps = Vec::new();
-    for (ix, picture) in pictures.iter().enumerate() {
+    for (ix, test_image) in images.iter().enumerate() {
         if unplugged == Some(ix) {
             steps.push(Step::Unplugged { secs: 0.5 });
         }
-        steps.push(Step::Picture {
+        steps.push(Step::Image {
             sequence: ix as u32,
             age_nanos: 0,
             is_damaged: false,
-            bytes: Some(picture.pixels.clone()),
+            bytes: Some(test_image.pixels.clone()),
         });
     }
     steps

@@ -3,18 +3,24 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::{Settings, SourceParams};
-use splat_mapper::frame::{Frame, RgbImage};
-use splat_mapper::node::{Job, Stop, pipeline};
-use splat_mapper::source::camera::live::{Health, HealthWatch};
-use splat_mapper::source::camera::{CameraError, CameraSource, Coding, Layout};
-use splat_mapper::source::pixels::PixelFormat;
-use splat_mapper::source::synthetic::SynthSettings;
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::source::{self, Source};
-
-use crate::camera_script::{Clock, Script, Step, layout, picture, steps_of};
+use crate::camera_script::{Clock, Script, Step, layout, steps_of, test_image};
+use splat_image::pixel_format::PixelFormat;
+use splat_io::camera::driver::{Coding, Layout};
+use splat_io::camera::live::{CameraStatus, CameraStatusWatch};
+use splat_io::camera::source::CameraSource;
+use splat_io::camera_error::CameraError;
+use splat_io::frame_source::Source;
+use splat_io::params::SourceParams;
+use splat_mapper::node::engines::Engines;
+use splat_mapper::node::job::Job;
+use splat_mapper::node::stop::Stop;
+use splat_mapper::node::{open_source, pipeline};
+use splat_mapper::params::settings::Settings;
+use splat_synth::settings::SynthSettings;
+use splat_synth::take::Take;
+use splat_types::frame::Frame;
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
 
 const SMALL: (u32, u32) = (32, 24);
 
@@ -35,7 +41,11 @@ fn frames(source: &mut CameraSource, n: usize) -> Vec<Frame> {
     (0..n).map(|_| source.next().unwrap()).collect()
 }
 
-fn wait_for(health: &HealthWatch, is_wanted: impl Fn(&Health) -> bool, within: f64) -> f64 {
+fn wait_for(
+    health: &CameraStatusWatch,
+    is_wanted: impl Fn(&CameraStatus) -> bool,
+    within: f64,
+) -> f64 {
     let watch = Stopwatch::start();
     while !is_wanted(&health.get()) {
         assert!(watch.secs() < within, "{:?} after {within} s", health.get());
@@ -60,9 +70,9 @@ fn in_background(mut source: CameraSource) -> (Arc<AtomicBool>, impl FnOnce() ->
 #[test]
 fn an_unplugged_camera_is_said_within_a_second_and_goes_on_within_two_of_its_return() {
     let away = 1.0;
-    let mut steps: Vec<Step> = (0..5).map(picture).collect();
+    let mut steps: Vec<Step> = (0..5).map(test_image).collect();
     steps.push(Step::Unplugged { secs: away });
-    steps.extend((0..5).map(picture));
+    steps.extend((0..5).map(test_image));
     let script = small(Clock::Real, steps);
     let source = source_of(&script, &params());
     let health = source.health();
@@ -82,16 +92,16 @@ fn an_unplugged_camera_is_said_within_a_second_and_goes_on_within_two_of_its_ret
 #[test]
 fn a_hanging_camera_is_said_within_three_seconds_and_opened_again() {
     let steps = (0..3)
-        .map(picture)
+        .map(test_image)
         .chain([Step::Hang])
-        .chain((0..3).map(picture));
+        .chain((0..3).map(test_image));
     let script = small(Clock::Real, steps);
     let source = source_of(&script, &params());
     let health = source.health();
     let (asked, join) = in_background(source);
     let said = wait_for(&health, |health| !health.is_streaming, 3.0);
     assert!(said > 1.0, "a camera may pause: {said} s");
-    assert!(health.get().fault.unwrap().contains("no picture for 2."));
+    assert!(health.get().fault.unwrap().contains("no image for 2."));
     wait_for(&health, |health| health.is_streaming, 2.0);
     asked.store(true, Ordering::Relaxed);
     assert_eq!(join().counts().interruptions, 1);
@@ -99,7 +109,10 @@ fn a_hanging_camera_is_said_within_three_seconds_and_opened_again() {
 
 #[test]
 fn the_end_comes_soon_after_it_is_asked_for_while_the_camera_is_away() {
-    let script = small(Clock::Real, [picture(0), Step::Unplugged { secs: 1000.0 }]);
+    let script = small(
+        Clock::Real,
+        [test_image(0), Step::Unplugged { secs: 1000.0 }],
+    );
     let source = source_of(&script, &params());
     let health = source.health();
     let (asked, join) = in_background(source);
@@ -112,12 +125,12 @@ fn the_end_comes_soon_after_it_is_asked_for_while_the_camera_is_away() {
 }
 
 #[test]
-fn damaged_pictures_and_skipped_numbers_are_counted_and_repeats_are_not() {
+fn damaged_images_and_skipped_numbers_are_counted_and_repeats_are_not() {
     let numbers = [u32::MAX - 1, u32::MAX, 2, 2, 3, 10];
-    let mut steps: Vec<Step> = numbers.into_iter().map(picture).collect();
+    let mut steps: Vec<Step> = numbers.into_iter().map(test_image).collect();
     steps.insert(
         4,
-        Step::Picture {
+        Step::Image {
             sequence: 2,
             age_nanos: 0,
             is_damaged: true,
@@ -135,7 +148,7 @@ fn damaged_pictures_and_skipped_numbers_are_counted_and_repeats_are_not() {
 
 #[test]
 fn stamps_are_wall_time_and_never_lie_in_the_future() {
-    let aged = |age_nanos| Step::Picture {
+    let aged = |age_nanos| Step::Image {
         sequence: 0,
         age_nanos,
         is_damaged: false,
@@ -148,7 +161,7 @@ fn stamps_are_wall_time_and_never_lie_in_the_future() {
         .iter()
         .map(|f| f.stamp.nanos)
         .collect();
-    // The script's clock goes on by 100 ms a picture, and its wall clock is 1000 s ahead of it.
+    // The script's clock goes on by 100 ms an image, and its wall clock is 1000 s ahead of it.
     let at = |n: i64| 1_000_000_000_000 + 5 + n * 100_000_000;
     assert_eq!(stamps, [at(1) - 40_000_000, at(2), at(3)]);
 }
@@ -168,14 +181,14 @@ fn a_camera_in_use_is_an_error_at_the_start_that_names_the_way_out() {
 }
 
 #[test]
-fn pictures_that_are_too_short_or_no_jpeg_are_counted_and_the_rest_goes_on() {
-    let short = Step::Picture {
+fn images_that_are_too_short_or_no_jpeg_are_counted_and_the_rest_goes_on() {
+    let short = Step::Image {
         sequence: 1,
         age_nanos: 0,
         is_damaged: false,
         bytes: Some(vec![7; 100]),
     };
-    let full = |sequence| Step::Picture {
+    let full = |sequence| Step::Image {
         sequence,
         age_nanos: 0,
         is_damaged: false,
@@ -211,40 +224,53 @@ fn pictures_that_are_too_short_or_no_jpeg_are_counted_and_the_rest_goes_on() {
 
 #[test]
 fn uris_of_cameras_that_are_not_there_say_what_to_do() {
-    let message = |uri: &str| source::open(uri, &params(), 0).err().unwrap().to_string();
+    let message = |uri: &str| {
+        open_source::open(uri, &params(), 0)
+            .err()
+            .unwrap()
+            .to_string()
+    };
     #[cfg(all(feature = "camera-v4l", target_os = "linux"))]
     {
         assert!(message("v4l2:/dev/video4711").contains("no camera is there"));
         assert!(message("v4l2:/dev/null").contains("not a camera"));
     }
-    #[cfg(not(feature = "camera-nokhwa"))]
-    assert!(message("webcam:0").contains("--features camera-nokhwa"));
+    #[cfg(all(
+        feature = "camera-v4l",
+        not(feature = "camera-nokhwa"),
+        target_os = "linux"
+    ))]
+    {
+        let absent = message("webcam:4711");
+        assert!(absent.contains("no camera is there") && absent.contains("/dev/video4711"));
+        assert!(message("webcam:first").contains("is no source URI"));
+    }
     assert!(message("camera:0").contains("v4l2:/dev/video0"));
 }
 
-/// Pictures of a walk through a room.
+/// Images of a walk through a room.
 pub fn room(n_frames: u32) -> Vec<RgbImage> {
     let text = format!("room?frames={n_frames}&width=192&height=144&speed=3");
     let take = Take::new(SynthSettings::parse(&text).unwrap()).unwrap();
-    (0..n_frames).map(|ix| take.picture(ix)).collect()
+    (0..n_frames).map(|ix| take.image(ix)).collect()
 }
 
 #[test]
 fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
-    let pictures = room(12);
+    let images = room(12);
     let map = |unplugged| {
         let size = layout(PixelFormat::Rgb, (192, 144));
-        let script = Script::new(size, Clock::Nanos(0), steps_of(&pictures, unplugged));
+        let script = Script::new(size, Clock::Nanos(0), steps_of(&images, unplugged));
         let mut settings = Settings::shipped();
         // Small and quick: what matters is whether both runs agree.
         for setting in [
             "sequential=true",
-            "map.steps=10",
+            "train.steps=10",
             "source.max_frames=12",
             "backend=cpu",
             "mvs.backend=cpu",
             "mvs.max_side=96",
-            "mvs.n_depths=32",
+            "mvs.depth_planes=32",
             "sfm.max_features=600",
             "track.enabled=false",
         ] {
@@ -257,7 +283,8 @@ fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
             is_live: false,
             stop: Stop::default(),
             out: None,
-            outbox: None,
+            publisher: None,
+            engines: Engines::default(),
         };
         let outcome = pipeline::run(job, &mut |_| {}).unwrap();
         let stamps: Vec<Stamp> = outcome

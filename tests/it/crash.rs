@@ -6,11 +6,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rand::{RngExt as _, SeedableRng as _};
-use splat_mapper::clock::Stopwatch;
-use splat_mapper::map::checkpoint::{self, Checkpoint};
-use splat_mapper::map::snapshot::Snapshot;
 
 use crate::formats::random_snapshot;
+use splat_mapper::node::save_map::{MapFile, save_map};
+use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint};
+use splat_types::snapshot::Snapshot;
+use splat_types::time::Stopwatch;
 
 /// Where the saving child writes; without it the test that is the child does nothing.
 const PLACE: &str = "SPLAT_MAPPER_TEST_CRASH";
@@ -31,7 +32,7 @@ fn a_child_that_saves_until_it_is_killed() {
     let maps = [0, 1].map(|which| Checkpoint::of(map(which), 1, 1));
     loop {
         for checkpoint in &maps {
-            checkpoint::write(checkpoint, Path::new(&path)).unwrap();
+            save_map(MapFile::Checkpoint(checkpoint), Path::new(&path)).unwrap();
         }
     }
 }
@@ -84,7 +85,7 @@ fn a_run_that_dies_leaves_the_last_autosave() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_splat-mapper"))
         .args(["replay", "synthetic:endless?frames=100000", "--out"])
         .arg(&out)
-        .args(["--geometry", "known", "--backend", "cpu"])
+        .args(["--geometry", "ground_truth", "--backend", "cpu"])
         .args(["--set", "map.autosave_secs=0.2", "--steps", "1000000"])
         .stdout(Stdio::null())
         .stderr(Stdio::null())

@@ -1,14 +1,13 @@
-//! Lengths that lie, in messages, records and pictures: no memory beyond the bytes at hand.
+//! Lengths that lie, in messages, records and images: no memory beyond the bytes at hand.
 
 use mcap::Compression;
-use splat_mapper::ros::{CameraInfo, CompressedImage, Image, Message, TfMessage};
-use splat_mapper::source;
 
 use crate::bags::{self, BagForm, BagWriter, Endian, tenth};
 use crate::hostile_bags::{salvage, small_chunks};
 use crate::sources::{TOPIC, sample_bag};
+use splat_msgs::ros::{CameraInfo, CompressedImage, Image, Message, TfMessage};
 
-/// One message of any bytes, then three good pictures.
+/// One message of any bytes, then three good images.
 fn bag_with(type_name: &str, topic: &str, payload: &[u8]) -> BagWriter {
     let mut bag = BagWriter::new(BagForm::default());
     bag.add_payload(topic, type_name, tenth(0), payload);
@@ -86,7 +85,7 @@ fn lengths_of_a_billion_in_messages_take_no_memory() {
             for (type_name, topic, payload) in types {
                 for lying in with_billions(&payload) {
                     let (frames, fault) = salvage(&bag_with(type_name, topic, &lying).finish());
-                    // A lie in the stamp of the first picture may put the three others before it.
+                    // A lie in the stamp of the first image may put the three others before it.
                     assert!(
                         frames.len() <= 4 && fault.is_none(),
                         "{type_name}: {fault:?}"
@@ -98,9 +97,9 @@ fn lengths_of_a_billion_in_messages_take_no_memory() {
 }
 
 #[test]
-fn pictures_that_claim_huge_sizes_take_no_memory() {
+fn images_that_claim_huge_sizes_take_no_memory() {
     in_little_memory(
-        "declared_lengths::pictures_that_claim_huge_sizes_take_no_memory",
+        "declared_lengths::images_that_claim_huge_sizes_take_no_memory",
         || {
             let rgb = vec![50; 48 * 32 * 3];
             let jpeg = bags::jpeg(tenth(0), (48, 32), &rgb).data;
@@ -113,7 +112,7 @@ fn pictures_that_claim_huge_sizes_take_no_memory() {
                 lying[start_of_frame + 5..start_of_frame + 7].copy_from_slice(&side.to_be_bytes());
                 lying[start_of_frame + 7..start_of_frame + 9].copy_from_slice(&side.to_be_bytes());
                 assert!(
-                    source::decode::compressed(&lying).is_err(),
+                    splat_image::codec::compressed(&lying).is_err(),
                     "JPEG of {side}"
                 );
             }
@@ -141,11 +140,11 @@ fn pictures_that_claim_huge_sizes_take_no_memory() {
                             ..small
                         };
                         assert!(
-                            source::decode::raw(&message).is_err(),
+                            splat_io::ros_image::raw(&message).is_err(),
                             "{encoding} {width}x{height} step {step}"
                         );
                         assert!(
-                            source::decode::depth(&message).is_err(),
+                            splat_io::ros_image::depth(&message).is_err(),
                             "{encoding} {width}x{height} step {step}"
                         );
                     }

@@ -1,18 +1,17 @@
-//! Deltas: a client that follows holds what the publisher says, bit for bit, and hears little.
+//! Deltas: a client that follows holds what the publisher says, bit for bit, and receives little.
 
 use std::sync::Arc;
 
-use splat_mapper::map::layout;
-use splat_mapper::map::snapshot::Snapshot;
-use splat_mapper::publish::delta::{Published, SplatDelta, Update};
-use splat_mapper::publish::follow::{Followed, Follower};
-use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::publish::wire::{
-    self, KeyframeArray, MAX_MESSAGE_BYTES, Messages, SplatChunk, SplatManifest,
-};
-use splat_mapper::splat::Splats;
-
 use crate::formats::{Dice, random_snapshot};
+use splat_msgs::client::follower::{Followed, Follower};
+use splat_msgs::map_messages::{
+    self, KeyframeArray, MAX_MESSAGE_BYTES, Messages, SplatChunk, SplatDelta, SplatManifest,
+};
+use splat_msgs::type_hash::dds_type_name;
+use splat_ros::map_stream::{PublishedMap, Update};
+use splat_types::snapshot::Snapshot;
+use splat_types::splats::layout;
+use splat_types::splats::splats::Splats;
 
 const FRAME: &str = "splat_map";
 const CHUNK_BYTES: usize = 8192;
@@ -23,11 +22,15 @@ fn whole(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
     let messages = Messages::new(snapshot, FRAME, CHUNK_BYTES);
     let mut sent = vec![(
         dds_type_name::<SplatManifest>(),
-        wire::payload(&messages.manifest()).unwrap(),
+        map_messages::payload(&messages.manifest()).unwrap(),
     )];
-    let keyframes = messages.keyframes().map(|m| wire::payload(&m).unwrap());
+    let keyframes = messages
+        .keyframes()
+        .map(|m| map_messages::payload(&m).unwrap());
     sent.extend(keyframes.map(|p| (dds_type_name::<KeyframeArray>(), p)));
-    let chunks = messages.chunks().map(|m| wire::payload(&m).unwrap());
+    let chunks = messages
+        .chunks()
+        .map(|m| map_messages::payload(&m).unwrap());
     sent.extend(chunks.map(|p| (dds_type_name::<SplatChunk>(), p)));
     sent
 }
@@ -44,7 +47,7 @@ fn pieces(update: &Update, held: &Snapshot) -> Vec<SplatDelta> {
 
 fn follow(follower: &mut Follower, pieces: &[SplatDelta]) -> Followed {
     let mut steps = pieces.iter().map(|piece| {
-        let payload = wire::payload(piece).unwrap();
+        let payload = map_messages::payload(piece).unwrap();
         assert!(payload.len() <= MAX_MESSAGE_BYTES);
         follower.add_payload(&dds_type_name::<SplatDelta>(), &payload)
     });
@@ -91,7 +94,7 @@ fn next(of: &Snapshot, dice: &mut Dice) -> Snapshot {
 #[test]
 fn who_follows_and_who_joins_late_hold_the_published_map() {
     let mut dice = Dice(7);
-    let (mut published, mut follower) = (Published::default(), Follower::new(MAX_BYTES));
+    let (mut published, mut follower) = (PublishedMap::default(), Follower::new(MAX_BYTES));
     let mut newest = Arc::new(random_snapshot(4000, 6, 1, 1));
     assert!(matches!(
         published.update(&newest, false, 0.3),
@@ -138,7 +141,7 @@ fn who_follows_and_who_joins_late_hold_the_published_map() {
 #[test]
 fn a_delta_stays_below_its_share_and_the_rest_comes_later() {
     let mut dice = Dice(9);
-    let mut published = Published::default();
+    let mut published = PublishedMap::default();
     let first = Arc::new(random_snapshot(3000, 2, 0, 1));
     published.update(&first, false, 0.05);
     let second = next(&first, &mut dice);
@@ -167,7 +170,7 @@ fn a_delta_stays_below_its_share_and_the_rest_comes_later() {
 #[test]
 fn a_lost_piece_a_forged_one_and_another_epoch_are_noticed() {
     let mut dice = Dice(5);
-    let mut published = Published::default();
+    let mut published = PublishedMap::default();
     let first = Arc::new(random_snapshot(3000, 2, 1, 1));
     published.update(&first, false, 1.0);
     let second = Arc::new(next(&first, &mut dice));
@@ -204,7 +207,7 @@ fn a_lost_piece_a_forged_one_and_another_epoch_are_noticed() {
     assert_eq!(fresh().add_delta(other), Followed::Missed);
     // Noise.
     let mut follower = fresh();
-    let good = wire::payload(&sent[0]).unwrap();
+    let good = map_messages::payload(&sent[0]).unwrap();
     for _ in 0..2000 {
         let mut payload = good.clone();
         (0..4).for_each(|_| payload[dice.below(200)] = dice.roll() as u8);
@@ -215,7 +218,7 @@ fn a_lost_piece_a_forged_one_and_another_epoch_are_noticed() {
 
 #[test]
 fn a_new_epoch_or_map_goes_out_whole() {
-    let mut published = Published::default();
+    let mut published = PublishedMap::default();
     let first = Arc::new(random_snapshot(100, 2, 1, 1));
     published.update(&first, false, 0.1);
     for changed in [

@@ -3,10 +3,11 @@
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_mapper::clock::Stamp;
+
 use splat_mapper::eval::evaluation::compare;
 use splat_mapper::eval::trajectory::TimedPose;
-use splat_mapper::pose::Rigid;
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
 fn vector(rng: &mut Pcg64Mcg, size: f64) -> DVec3 {
     DVec3::from_array(std::array::from_fn(|_| rng.random_range(-size..size)))

@@ -5,13 +5,15 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::Stamp;
-use splat_mapper::export::ply;
-use splat_mapper::map::checkpoint::{self, Checkpoint, CheckpointError};
-use splat_mapper::map::snapshot::{KeyframePose, Scale, Snapshot};
-use splat_mapper::pose::Rigid;
-use splat_mapper::splat::Splats;
+
+use splat_mapper::node::save_map::{MapFile, save_map};
+use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint, CheckpointError};
+use splat_types::camera::Intrinsics;
+use splat_types::snapshot::{KeyframePose, Scale, Snapshot};
+use splat_types::splats::ply;
+use splat_types::splats::splats::Splats;
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
 /// xorshift64*; tests need variety, not quality.
 pub(crate) struct Dice(pub(crate) u64);
@@ -62,7 +64,7 @@ pub(crate) fn random_snapshot(
     let poses = (0..n_keyframes).map(|ix| KeyframePose {
         keyframe_id: 3 * ix as u32,
         stamp: Stamp::from_nanos(1_700_000_000_123_456_789 + 100_000_000 * ix as i64),
-        map_from_cam: Rigid::new(
+        world_from_cam: Rigid::new(
             DQuat::from_xyzw(number(), number(), number(), 1.0).normalize(),
             DVec3::new(number(), number(), number()),
         ),
@@ -91,7 +93,7 @@ pub(crate) fn random_snapshot(
 fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
     Checkpoint {
         landmarks: vec![7; 33],
-        ages: (0..n_splats as u16).collect(),
+        update_counts: (0..n_splats as u16).collect(),
         ..Checkpoint::of(random_snapshot(n_splats, 5, sh_degree, 9), 11, 3000)
     }
 }
@@ -108,7 +110,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
     let path = folder.path().join("map.splatmap");
     for (n_splats, sh_degree) in [(0, 0), (1, 0), (300, 1), (50, 2), (50, 3)] {
         let written = checkpoint(n_splats, sh_degree);
-        checkpoint::write(&written, &path).unwrap();
+        save_map(MapFile::Checkpoint(&written), &path).unwrap();
         let back = checkpoint::read(&path).unwrap();
         assert!(
             back.snapshot == written.snapshot,
@@ -116,7 +118,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         );
         assert_eq!((back.seed, back.steps), (11, 3000));
         assert_eq!(back.landmarks, written.landmarks);
-        assert_eq!(back.ages, written.ages);
+        assert_eq!(back.update_counts, written.update_counts);
     }
 }
 
@@ -124,7 +126,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
 fn a_checkpoint_cut_anywhere_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.splatmap");
-    checkpoint::write(&checkpoint(200, 1), &path).unwrap();
+    save_map(MapFile::Checkpoint(&checkpoint(200, 1)), &path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let mut boundaries = vec![0, 8, 12, 16, 20];
     let mut end = 20;
@@ -154,7 +156,7 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
 fn a_flipped_bit_anywhere_in_a_checkpoint_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.splatmap");
-    checkpoint::write(&checkpoint(10, 0), &path).unwrap();
+    save_map(MapFile::Checkpoint(&checkpoint(10, 0)), &path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let mut file = std::fs::OpenOptions::new().write(true).open(&path).unwrap();
     // Whole files written anew 2600 times would take ten seconds of disk.
@@ -206,7 +208,7 @@ fn a_section_of_the_future_is_skipped() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.splatmap");
     let written = checkpoint(20, 1);
-    checkpoint::write(&written, &path).unwrap();
+    save_map(MapFile::Checkpoint(&written), &path).unwrap();
     let mut bytes = std::fs::read(&path).unwrap();
     bytes[12] += 1;
     let crc = crc32c::crc32c(&bytes[..16]).to_le_bytes();
@@ -228,7 +230,7 @@ fn a_number_that_is_not_finite_stays_out_although_the_checksums_fit() {
     let path = folder.path().join("map.splatmap");
     let mut bad = checkpoint(20, 1);
     Arc::make_mut(&mut bad.snapshot.splats).means[7][1] = f32::NAN;
-    checkpoint::write(&bad, &path).unwrap();
+    save_map(MapFile::Checkpoint(&bad), &path).unwrap();
     let fault = checkpoint::read(&path).unwrap_err().to_string();
     assert!(fault.contains("means of splat 7 is NaN"), "{fault}");
 }
@@ -239,7 +241,7 @@ fn a_ply_reads_back_equal_for_every_sh_degree() {
     let path = folder.path().join("map.ply");
     for (n_splats, sh_degree) in [(0, 0), (1, 3), (1500, 0), (1024, 1), (1025, 2), (300, 3)] {
         let mut splats = random_splats(n_splats, sh_degree, 4);
-        ply::write(&splats, &path).unwrap();
+        save_map(MapFile::Ply(&splats), &path).unwrap();
         let back = ply::read(&path).unwrap();
         splats.anchors.fill(0);
         assert!(back == splats, "{n_splats} splats of degree {sh_degree}");
@@ -260,7 +262,7 @@ fn a_ply_has_the_header_and_row_that_viewers_expect() {
         sh_degree: 1,
         anchors: vec![3],
     };
-    ply::write(&splats, &path).unwrap();
+    save_map(MapFile::Ply(&splats), &path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n\
         property float x\nproperty float y\nproperty float z\n\
@@ -313,7 +315,7 @@ fn a_ply_of_another_program_reads_with_its_own_order_and_extras() {
 fn a_hostile_ply_is_an_error_that_says_why() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("hostile.ply");
-    ply::write(&random_splats(4, 0, 1), &path).unwrap();
+    save_map(MapFile::Ply(&random_splats(4, 0, 1)), &path).unwrap();
     let good = std::fs::read(&path).unwrap();
     let header_end = good.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let header = String::from_utf8(good[..header_end].to_vec()).unwrap();

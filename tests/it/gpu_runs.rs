@@ -1,121 +1,45 @@
 //! The whole program on a GPU, which may be software: it maps, twice the same, and says when there is none.
 
-use std::cell::RefCell;
 use std::path::Path;
 use std::process::Command;
 
 use serde_json::Value;
-use splat_mapper::gpu::device::Wanted;
-use splat_mapper::splat::gradients::Gradients;
-use splat_mapper::splat::wgpu::{self, WgpuEngine};
-use splat_mapper::splat::{Engine, Splats, StepSettings, TrainingView};
 
-use crate::backends::ORDINARY;
-use crate::reference::random;
+use splat_engine::wgpu::engine::WgpuEngine;
+use splat_gpu::device::Wanted;
 
 const DEMO: &str = "recordings/demo.mcap";
 
 /// On lavapipe where there is no GPU; `scripts/setup test` installs it.
-pub fn gpu_engine(subgroups: bool) -> WgpuEngine {
-    opened(Wanted {
-        any_kind: true,
-        subgroups,
-        float_atomics: false,
-    })
-}
-
-/// Which adds up in any order, where the adapter has float atomics.
-pub fn fast_engine() -> WgpuEngine {
-    opened(Wanted {
+pub fn gpu_engine() -> WgpuEngine {
+    let wanted = Wanted {
         any_kind: true,
         subgroups: true,
-        float_atomics: true,
-    })
-}
-
-fn opened(wanted: Wanted) -> WgpuEngine {
+        float_atomics: false,
+    };
     WgpuEngine::new(wanted).unwrap_or_else(|error| panic!("run scripts/setup test: {error}"))
-}
-
-pub fn gpu_gradients(
-    subgroups: bool,
-    splats: &Splats,
-    view: &TrainingView,
-    settings: &StepSettings,
-) -> Gradients {
-    thread_local! {
-        // Opening a device compiles all shaders.
-        static ENGINES: RefCell<[Option<WgpuEngine>; 2]> = const { RefCell::new([None, None]) };
-    }
-    ENGINES.with_borrow_mut(|engines| {
-        let engine = engines[usize::from(subgroups)].get_or_insert_with(|| gpu_engine(subgroups));
-        wgpu::gradients(engine, splats, view, [[0.0; 3]; 2], settings).unwrap()
-    })
-}
-
-#[test]
-fn sums_in_any_order_are_the_same_but_for_rounding() {
-    let mut fast = fast_engine();
-    if !fast.sums_in_any_order() {
-        eprintln!(
-            "not measured: this adapter has no float atomics: {}",
-            fast.adapter()
-        );
-        return;
-    }
-    for seed in 0..4 {
-        let scene = random::scene(seed, &ORDINARY);
-        let settings = random::settings();
-        let exact = gpu_gradients(true, &scene.splats, &scene.view, &settings);
-        let found = wgpu::gradients(
-            &mut fast,
-            &scene.splats,
-            &scene.view,
-            [[0.0; 3]; 2],
-            &settings,
-        );
-        let found = found.unwrap();
-        let pairs = [
-            (found.means.as_flattened(), exact.means.as_flattened()),
-            (
-                found.log_scales.as_flattened(),
-                exact.log_scales.as_flattened(),
-            ),
-            (found.quats.as_flattened(), exact.quats.as_flattened()),
-            (&found.opacity_logits, &exact.opacity_logits),
-            (&found.sh, &exact.sh),
-        ];
-        for (found, exact) in pairs {
-            let norm =
-                |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
-            let off = norm(&mut found.iter().zip(exact).map(|(a, b)| f64::from(a - b)));
-            let all = norm(&mut exact.iter().map(|v| f64::from(*v)));
-            assert!(
-                all > 0.0 && off < 1e-5 * all,
-                "seed {seed}: {off:e} of {all:e}"
-            );
-        }
-    }
 }
 
 /// A small replay; its report and what it said last.
 fn replay(out: &Path, drivers: Option<&str>) -> (Option<i32>, Option<Value>, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splat-mapper"));
-    command.args(["replay", DEMO, "--backend", "wgpu", "--geometry", "known"]);
+    command.args([
+        "replay",
+        DEMO,
+        "--backend",
+        "wgpu",
+        "--geometry",
+        "ground_truth",
+    ]);
     command.args([
         "--max-side",
         "96",
         "--steps",
         "40",
         "--set",
-        "map.mcmc=true",
+        "mcmc.enabled=true",
     ]);
-    command.args([
-        "--set",
-        "source.max_frames=12",
-        "--set",
-        "map.mcmc_every=20",
-    ]);
+    command.args(["--set", "source.max_frames=12", "--set", "mcmc.every=20"]);
     command.arg("--out").arg(out);
     if let Some(drivers) = drivers {
         command.env("VK_DRIVER_FILES", drivers);

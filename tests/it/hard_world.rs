@@ -1,15 +1,16 @@
-//! A small world for pictures that a camera had better not be placed by: textured boxes, seen by rows at their own time.
+//! A small world for images that a camera had better not be registered by: textured boxes, seen by rows at their own time.
 
 use std::sync::Arc;
 
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::frame::{Frame, Keyframe, RgbImage};
-use splat_mapper::pose::Rigid;
 
 use crate::sfm::Shown;
+use splat_types::camera::Intrinsics;
+use splat_types::frame::{Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::Rigid;
 
 pub(crate) const LENS: Intrinsics = Intrinsics {
     width_px: 400,
@@ -95,11 +96,11 @@ pub(crate) struct Flaws {
     pub(crate) noise: f64,
 }
 
-/// The pictures that a camera takes at these poses (`world_from_cam`).
+/// The images that a camera takes at these poses (`world_from_cam`).
 pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrinsics) -> Shown {
     let keyframe = |(ix, pose): (usize, &Rigid)| {
         let next = poses.get(ix + 1).unwrap_or(pose);
-        let image = Arc::new(picture(solids, (pose, next), flaws, ix));
+        let image = Arc::new(test_image(solids, (pose, next), flaws, ix));
         let frame = Frame {
             seq: ix as u64,
             stamp: Stamp::from_secs(ix as f64),
@@ -107,7 +108,7 @@ pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrin
             intrinsics: Some(lens),
             truth: None,
             odometry: None,
-            truth_depth: None,
+            sensor_depth: None,
             is_held_out: false,
         };
         Arc::new(Keyframe {
@@ -122,7 +123,7 @@ pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrin
     }
 }
 
-/// Exact z-depth at the pixel centres of a picture with this lens.
+/// Exact z-depth at the pixel centres of an image with this lens.
 pub(crate) fn depth(solids: &[Solid], pose: &Rigid, lens: &Intrinsics) -> Vec<f64> {
     let rows = 0..lens.height_px;
     let pixels = rows.flat_map(|y| (0..lens.width_px).map(move |x| (x, y)));
@@ -137,8 +138,8 @@ pub(crate) fn depth(solids: &[Solid], pose: &Rigid, lens: &Intrinsics) -> Vec<f6
     pixels.map(one).collect()
 }
 
-/// Share of the picture that the solids from the `first` on take.
-pub(crate) fn share_in_sight(solids: &[Solid], first: usize, pose: &Rigid, ix: usize) -> f64 {
+/// Share of the image that the solids from the `first` on take.
+pub(crate) fn share_in_observation(solids: &[Solid], first: usize, pose: &Rigid, ix: usize) -> f64 {
     let pixels = (0..LENS.height_px)
         .step_by(8)
         .flat_map(|y| (0..LENS.width_px).step_by(8).map(move |x| (x, y)));
@@ -166,7 +167,12 @@ fn nearest(solids: &[Solid], origin: DVec3, direction: DVec3, ix: usize) -> Opti
     hits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|hit| hit.1)
 }
 
-fn picture(solids: &[Solid], (pose, next): (&Rigid, &Rigid), flaws: Flaws, ix: usize) -> RgbImage {
+fn test_image(
+    solids: &[Solid],
+    (pose, next): (&Rigid, &Rigid),
+    flaws: Flaws,
+    ix: usize,
+) -> RgbImage {
     let (w, h) = (LENS.width_px as usize, LENS.height_px as usize);
     let mut light = Vec::with_capacity(w * h);
     for y in 0..h {

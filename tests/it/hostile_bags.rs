@@ -3,17 +3,18 @@
 use mcap::Compression;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
-use splat_mapper::frame::Frame;
-use splat_mapper::ros::{CameraInfo, Image, Message};
-use splat_mapper::source::{self, SourceCounts};
 
 use crate::bags::{self, BagForm, BagWriter, Endian, tenth};
 use crate::sources::{TOPIC, frames_of, params, sample_bag, saved};
+use splat_io::frame_source::SourceCounts;
+use splat_mapper::node::open_source;
+use splat_msgs::ros::{CameraInfo, Image, Message};
+use splat_types::frame::Frame;
 
 /// Frames and fault of a recording; one that does not even open has no frames and its error as fault.
 pub fn salvage(bytes: &[u8]) -> (Vec<Frame>, Option<String>) {
     let (_guard, path) = saved(bytes);
-    match source::open(path.to_str().unwrap(), &params(), 0) {
+    match open_source::open(path.to_str().unwrap(), &params(), 0) {
         Ok(mut source) => {
             let frames = std::iter::from_fn(|| source.next()).collect();
             (frames, source.counts().fault)
@@ -30,7 +31,7 @@ pub fn small_chunks(compression: Option<Compression>) -> BagForm {
     }
 }
 
-fn same_picture(a: &Frame, b: &Frame) -> bool {
+fn same_image(a: &Frame, b: &Frame) -> bool {
     a.stamp == b.stamp && a.image == b.image
 }
 
@@ -67,10 +68,7 @@ fn a_truncated_recording_gives_the_frames_before_the_cut_and_says_so() {
                 frames.len()
             );
             assert!(
-                frames
-                    .iter()
-                    .zip(&originals)
-                    .all(|(a, b)| same_picture(a, b)),
+                frames.iter().zip(&originals).all(|(a, b)| same_image(a, b)),
                 "{form:?} cut at {cut}"
             );
             most = frames.len();
@@ -80,7 +78,7 @@ fn a_truncated_recording_gives_the_frames_before_the_cut_and_says_so() {
 }
 
 #[test]
-fn flipped_bits_in_a_recording_with_checksums_never_change_a_picture() {
+fn flipped_bits_in_a_recording_with_checksums_never_change_a_image() {
     let mut rng = Pcg32::seed_from_u64(2);
     for compression in [None, Some(Compression::Zstd), Some(Compression::Lz4)] {
         let bytes = sample_bag(small_chunks(compression)).finish();
@@ -93,10 +91,7 @@ fn flipped_bits_in_a_recording_with_checksums_never_change_a_picture() {
             let (frames, fault) = salvage(&damaged);
             n_faults += usize::from(fault.is_some());
             assert!(
-                frames
-                    .iter()
-                    .zip(&originals)
-                    .all(|(a, b)| same_picture(a, b)),
+                frames.iter().zip(&originals).all(|(a, b)| same_image(a, b)),
                 "byte {at} of {}",
                 bytes.len()
             );
@@ -133,7 +128,7 @@ fn many_flipped_bytes_without_checksums_end_without_panic() {
 }
 
 #[test]
-fn damaged_jpeg_and_png_are_undecodable_or_pictures_but_never_a_panic() {
+fn damaged_jpeg_and_png_are_undecodable_or_images_but_never_a_panic() {
     let mut rng = Pcg32::seed_from_u64(4);
     let rgb: Vec<u8> = (0..48 * 32 * 3).map(|i| (i * 7 % 256) as u8).collect();
     for whole in [
@@ -144,15 +139,15 @@ fn damaged_jpeg_and_png_are_undecodable_or_pictures_but_never_a_panic() {
             let mut damaged = whole.clone();
             let at = rng.random_range(0..damaged.len());
             damaged[at] ^= 1 << rng.random_range(0..8_u32);
-            if let Ok(picture) = source::decode::compressed(&damaged) {
+            if let Ok(image) = splat_image::codec::compressed(&damaged) {
                 assert_eq!(
-                    picture.pixels.len(),
-                    (picture.width_px * picture.height_px * 3) as usize
+                    image.pixels.len(),
+                    (image.width_px * image.height_px * 3) as usize
                 );
             }
             let cut = rng.random_range(0..whole.len() - 1);
             assert!(
-                source::decode::compressed(&whole[..cut]).is_err(),
+                splat_image::codec::compressed(&whole[..cut]).is_err(),
                 "cut at {cut} of {} decodes",
                 whole.len()
             );
@@ -161,7 +156,7 @@ fn damaged_jpeg_and_png_are_undecodable_or_pictures_but_never_a_panic() {
 }
 
 #[test]
-fn odd_pictures_are_counted_and_the_rest_stays_in_use() {
+fn odd_images_are_counted_and_the_rest_stays_in_use() {
     let mut bag = BagWriter::new(BagForm::default());
     let good = |n: i64| bags::image(tenth(n), "mono8", (4, 4), vec![n as u8; 16]);
     bag.add(
@@ -226,7 +221,7 @@ fn odd_pictures_are_counted_and_the_rest_stays_in_use() {
 }
 
 #[test]
-fn a_picture_of_one_pixel_is_a_frame() {
+fn a_image_of_one_pixel_is_a_frame() {
     let mut bag = BagWriter::new(BagForm::default());
     let dot = bags::image(tenth(0), "rgb8", (1, 1), vec![9, 8, 7]);
     bag.add(TOPIC, tenth(0), &dot);
@@ -239,7 +234,7 @@ fn a_picture_of_one_pixel_is_a_frame() {
     let (frames, _) = frames_of(&path, &params());
     assert_eq!(frames[0].image.pixels, [9, 8, 7]);
     let mosaic = bags::image(tenth(0), "bayer_rggb8", (1, 1), vec![5]);
-    assert_eq!(source::decode::raw(&mosaic).unwrap().pixels.len(), 3);
+    assert_eq!(splat_io::ros_image::raw(&mosaic).unwrap().pixels.len(), 3);
 }
 
 #[test]

@@ -3,10 +3,9 @@
 
 use std::path::Path;
 
-use splat_mapper::source::scene_formats::Layout;
-
 use crate::declared_lengths::in_little_memory;
 use crate::scene_formats::{Camera, cameras_bin, colmap, images_bin, pinhole, poses, transforms};
+use splat_io::scene_formats::scene::Layout;
 
 /// Every n-th length of a cut file is tried.
 const STRIDE: usize = 7;
@@ -35,7 +34,7 @@ fn cut_models_are_errors_that_name_the_file() {
         }
         std::fs::write(model.join(name), &whole).unwrap();
     }
-    // Points are found again in the pictures: whatever stands here is left alone.
+    // Points are found again in the images: whatever stands here is left alone.
     std::fs::write(model.join("points3D.bin"), [0xff; 8]).unwrap();
     assert_eq!(error_of(root.path()), None);
 }
@@ -149,7 +148,7 @@ fn names_do_not_lead_out_of_the_scene() {
     let outer = tempfile::tempdir().unwrap();
     let root = outer.path().join("scene");
     std::fs::create_dir(&root).unwrap();
-    crate::scene_formats::picture(outer.path(), "secret.png", (8, 8));
+    crate::scene_formats::test_image(outer.path(), "secret.png", (8, 8));
     let secret = outer.path().join("secret.png");
     for name in [
         "../secret.png",
@@ -162,7 +161,7 @@ fn names_do_not_lead_out_of_the_scene() {
         assert!(
             views
                 .iter()
-                .all(|v| v.picture.starts_with(&root) && !v.picture.is_file())
+                .all(|v| v.image.starts_with(&root) && !v.image.is_file())
         );
     }
 }

@@ -6,20 +6,21 @@ use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
 use serde_json::Value;
-use splat_mapper::clock::Stamp;
-use splat_mapper::eval::comparisons::Comparison;
-use splat_mapper::eval::html::{ReportInputs, write_html};
-use splat_mapper::eval::image_metrics::psnr;
-use splat_mapper::eval::report::Report;
-use splat_mapper::eval::trajectory::TimedPose;
-use splat_mapper::frame::RgbImage;
-use splat_mapper::pose::{Rigid, Similarity};
-use splat_mapper::splat::Rendering;
 
 use crate::report::sample_report;
+use splat_mapper::eval::image_metrics::psnr;
+use splat_mapper::eval::report_json::Report;
+use splat_mapper::eval::trajectory::TimedPose;
+use splat_mapper::params::settings::defaults;
+use splat_mapper::report::comparisons::Comparison;
+use splat_mapper::report::html::{ReportInputs, write_html};
+use splat_types::image::RgbImage;
+use splat_types::rendering::Rendering;
+use splat_types::time::Stamp;
+use splat_types::transform::{Rigid, Similarity};
 
 /// A checkered hill under a sky, seen from a little higher with each `ix`; `soft` stands for the map's blur.
-fn picture(width_px: u32, height_px: u32, ix: usize, soft: f64) -> Rendering {
+fn test_image(width_px: u32, height_px: u32, ix: usize, soft: f64) -> Rendering {
     let (mut rgb, mut depth) = (Vec::new(), Vec::new());
     for row in 0..height_px {
         for col in 0..width_px {
@@ -56,7 +57,7 @@ fn picture(width_px: u32, height_px: u32, ix: usize, soft: f64) -> Rendering {
 }
 
 fn comparison(keyframe_id: u32, width_px: u32, height_px: u32) -> Comparison {
-    let sharp = picture(width_px, height_px, keyframe_id as usize, 0.0);
+    let sharp = test_image(width_px, height_px, keyframe_id as usize, 0.0);
     let pixels = sharp
         .rgb
         .iter()
@@ -67,7 +68,7 @@ fn comparison(keyframe_id: u32, width_px: u32, height_px: u32) -> Comparison {
         height_px,
         pixels,
     };
-    let rendering = picture(
+    let rendering = test_image(
         width_px,
         height_px,
         keyframe_id as usize,
@@ -83,7 +84,7 @@ fn comparison(keyframe_id: u32, width_px: u32, height_px: u32) -> Comparison {
     }
 }
 
-/// A walk round an object, as `map_from_cam`.
+/// A walk round an object, as `world_from_cam`.
 fn walk(n: usize, wobble: f64) -> Vec<TimedPose> {
     (0..n)
         .map(|ix| {
@@ -139,6 +140,7 @@ fn write_sample(report: &Report, title: &str, comparisons: &[Comparison], path: 
     let inputs = ReportInputs {
         title,
         report,
+        defaults: &defaults(),
         comparisons,
         loss: &loss,
         psnr: &psnr,
@@ -182,18 +184,18 @@ fn the_page_is_whole_and_fetches_nothing() {
         "held out",
         "training view",
         "reference, aligned",
-        "map.steps",
+        "train.steps",
     ] {
         assert!(page.contains(text), "{text}");
     }
     assert!(
         page.contains("1 of 38 keyframes have no pose") && page.contains("motion blur"),
-        "faults are in sight"
+        "faults are in view"
     );
     assert!(!text_of_page.contains("NaN") && !text_of_page.contains("inf "));
 }
 
-/// The page without its embedded pictures: base64 may hold any letters and two slashes in a row.
+/// The page without its embedded images: base64 may hold any letters and two slashes in a row.
 fn outside_of_data(page: &str) -> String {
     page.split("data:image/jpeg;base64,")
         .map(|part| part.split_once('"').map_or(part, |(_, rest)| rest))
@@ -201,7 +203,7 @@ fn outside_of_data(page: &str) -> String {
 }
 
 #[test]
-fn embedded_pictures_decode_to_what_was_given() {
+fn embedded_images_decode_to_what_was_given() {
     use base64::Engine as _;
 
     let folder = tempfile::tempdir().unwrap();
@@ -224,7 +226,7 @@ fn embedded_pictures_decode_to_what_was_given() {
     assert_eq!(
         photo.dimensions(),
         (640, 73),
-        "large pictures are made smaller"
+        "large images are made smaller"
     );
     let sky = photo.get_pixel(320, 2).0;
     let expected = &shown.photo.pixels[3 * (2 * 700 + 350)..][..3];
@@ -275,6 +277,7 @@ fn a_run_that_made_nothing_still_has_a_page() {
         let inputs = ReportInputs {
             title: "",
             report: &report,
+            defaults: &defaults(),
             comparisons: &[],
             loss: &[(0, f64::NAN)],
             psnr: &[],

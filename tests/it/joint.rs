@@ -15,7 +15,7 @@ fn run(scene: &str, out: &Path, sets: &[&str], steps: u32) {
     command.args(["replay", scene, "--out", out.to_str().unwrap()]);
     command.args([
         "--geometry",
-        "known",
+        "ground_truth",
         "--steps",
         &steps,
         "--max-side",
@@ -35,8 +35,8 @@ fn run(scene: &str, out: &Path, sets: &[&str], steps: u32) {
 fn check(scene: &str) {
     let folder = tempfile::tempdir().unwrap();
     let noise = [
-        "known.rotation_noise_deg=0.5",
-        "known.translation_noise=0.01",
+        "ground_truth.rotation_noise_deg=0.5",
+        "ground_truth.translation_noise=0.01",
         "track.enabled=false",
     ];
     let at = |name: &str| folder.path().join(name);

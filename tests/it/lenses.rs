@@ -1,13 +1,13 @@
-//! Lens models against OpenCV, their inverses, and the pinhole pictures made of them.
+//! Lens models against OpenCV, their inverses, and the pinhole images made of them.
 
 use glam::{DVec2, DVec3};
-use splat_mapper::camera::{Distortion, Intrinsics, Lens};
-use splat_mapper::frame::RgbImage;
-use splat_mapper::source::rectify::Rectifier;
 
 use crate::sources::pixel;
+use splat_image::undistort::Undistorter;
+use splat_types::camera::{CameraModel, Distortion, Intrinsics};
+use splat_types::image::RgbImage;
 
-fn lenses() -> [(&'static str, Lens); 3] {
+fn lenses() -> [(&'static str, CameraModel); 3] {
     let intrinsics = Intrinsics {
         width_px: 640,
         height_px: 480,
@@ -33,7 +33,7 @@ fn lenses() -> [(&'static str, Lens); 3] {
     .map(|(name, distortion)| {
         (
             name,
-            Lens {
+            CameraModel {
                 intrinsics,
                 distortion,
             },
@@ -78,7 +78,7 @@ fn lenses_project_as_opencv_does() {
 #[test]
 fn every_pixel_projects_back_to_itself_through_its_ray() {
     let wide = Distortion::Equidistant([0.02, -0.01, 0.003, -0.0005]);
-    let fisheye = Lens {
+    let fisheye = CameraModel {
         intrinsics: Intrinsics {
             width_px: 640,
             height_px: 480,
@@ -133,7 +133,7 @@ fn a_rectified_pattern_is_what_the_pinhole_would_have_seen() {
         let pixels = grid()
             .flat_map(|(x, y)| value(lens.ray_in_cam(centre(x, y)).unwrap()))
             .collect();
-        let rectifier = Rectifier::new(&lens).unwrap();
+        let rectifier = Undistorter::new(&lens).unwrap();
         let seen = rectifier.rectify(RgbImage {
             width_px: i.width_px,
             height_px: i.height_px,
@@ -156,7 +156,7 @@ fn a_rectified_pattern_is_what_the_pinhole_would_have_seen() {
 #[test]
 fn straight_edges_are_straight_in_the_pinhole_and_nothing_is_black() {
     for (name, lens) in lenses() {
-        let rectifier = Rectifier::new(&lens).unwrap();
+        let rectifier = Undistorter::new(&lens).unwrap();
         let pinhole = rectifier.pinhole;
         for corner in [(0, 0), (639, 0), (0, 479), (639, 479), (320, 0), (0, 240)] {
             let at = rectifier.source_of(corner.0, corner.1);
@@ -168,7 +168,7 @@ fn straight_edges_are_straight_in_the_pinhole_and_nothing_is_black() {
             // The table holds f32; more would mean that the rim was clamped, that is, black or smeared.
             assert!(error < 1e-3, "{name} {corner:?}: clamped by {error} px");
         }
-        // The view is the widest: some rim pixel touches the rim of the lens's picture.
+        // The view is the widest: some rim pixel touches the rim of the lens's image.
         let rim = (0..640).map(|x| (x, 0)).chain((0..480).map(|y| (0, y)));
         let rim = rim
             .chain((0..640).map(|x| (x, 479)))
@@ -184,7 +184,7 @@ fn straight_edges_are_straight_in_the_pinhole_and_nothing_is_black() {
             .fold(f64::MAX, f64::min);
         assert!(
             least < 0.2,
-            "{name}: {least} px of the lens's picture are unused on every side"
+            "{name}: {least} px of the lens's image are unused on every side"
         );
         // A straight edge in space stays one: its middle lies on the line between its ends.
         let (from, to) = (DVec3::new(-0.4, -0.3, 1.0), DVec3::new(0.5, 0.35, 1.4));
@@ -197,7 +197,7 @@ fn straight_edges_are_straight_in_the_pinhole_and_nothing_is_black() {
         let (a, b) = (seen(0.0), seen(1.0));
         for step in 1..10 {
             let off = (b - a).perp_dot(seen(f64::from(step) * 0.1) - a).abs() / (b - a).length();
-            assert!(off < 0.01, "{name}: bent by {off} px");
+            assert!(off < 0.01, "{name}: distorted by {off} px");
         }
     }
 }

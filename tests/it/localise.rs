@@ -3,13 +3,15 @@
 use std::path::Path;
 use std::process::Command;
 
-use splat_mapper::config::{Params, Settings};
+use splat_geometry::similarity;
 use splat_mapper::eval::trajectory::{TimedPose, read_tum};
-use splat_mapper::frame::Frame;
-use splat_mapper::map::{align, checkpoint};
-use splat_mapper::pose::{Rigid, Similarity};
-use splat_mapper::source::open;
-use splat_mapper::track::Tracker;
+use splat_mapper::node::open_source::open;
+use splat_mapper::params::params::Params;
+use splat_mapper::params::settings::Settings;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_slam::track::tracker::Tracker;
+use splat_types::frame::Frame;
+use splat_types::transform::{Rigid, Similarity};
 
 /// Starts without a hint, and how many must find the place within the first second.
 const N_STARTS: usize = 20;
@@ -29,7 +31,7 @@ pub fn run(args: &[&str]) -> std::process::Output {
         .unwrap()
 }
 
-/// Maps the room once; returns map_from_truth.
+/// Maps the room once; returns world_from_gt.
 fn mapped(out: &Path) -> Similarity {
     let room = "synthetic:room?frames=80&width=320&height=240";
     let out = out.to_str().unwrap();
@@ -54,7 +56,7 @@ fn mapped(out: &Path) -> Similarity {
             Some((k.pose, frame.truth?))
         })
         .collect();
-    align::align(&pairs).unwrap()
+    similarity::of_poses(&pairs).unwrap()
 }
 
 fn frames(uri: &str) -> Vec<Frame> {
@@ -66,7 +68,7 @@ fn frames(uri: &str) -> Vec<Frame> {
 fn a_second_session_finds_its_place_without_a_hint() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("first");
-    let map_from_truth = mapped(&out);
+    let world_from_gt = mapped(&out);
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
     // Another day: the hand trembles otherwise, the camera is noisier and the light drifts.
     let again = "synthetic:room?frames=80&width=320&height=240&seed=5&noise=3&exposure=0.3";
@@ -82,10 +84,10 @@ fn a_second_session_finds_its_place_without_a_hint() {
         let Some((frame, pose)) = measured else {
             continue;
         };
-        let exact = map_from_truth.transform_pose(&frame.truth.unwrap());
+        let exact = world_from_gt.transform_pose(&frame.truth.unwrap());
         let off =
-            (pose.map_from_cam.translation - exact.translation).length() / map_from_truth.scale;
-        let turn = pose.map_from_cam.angle_to(&exact).to_degrees();
+            (pose.world_from_cam.translation - exact.translation).length() / world_from_gt.scale;
+        let turn = pose.world_from_cam.angle_to(&exact).to_degrees();
         assert!(
             off < 2.0 * MAX_OFF && turn < MAX_TURN_DEG,
             "start {first}: sure of a wrong place, off by {off:.3} m and {turn:.2} deg"
@@ -97,9 +99,9 @@ fn a_second_session_finds_its_place_without_a_hint() {
 
     let splatmap = out.join("map.splatmap");
     let before = std::fs::read(&splatmap).unwrap();
-    let told = folder.path().join("second");
-    let (map_file, told_dir) = (splatmap.to_str().unwrap(), told.to_str().unwrap());
-    let output = run(&["localise", map_file, again, "--out", told_dir, "--json"]);
+    let reported = folder.path().join("second");
+    let (map_file, given_dir) = (splatmap.to_str().unwrap(), reported.to_str().unwrap());
+    let output = run(&["localise", map_file, again, "--out", given_dir, "--json"]);
     assert!(
         output.status.success(),
         "{}",
@@ -109,9 +111,9 @@ fn a_second_session_finds_its_place_without_a_hint() {
     let tracked = summary["tracked"].as_u64().unwrap();
     eprintln!("{summary}");
     assert!(tracked >= 76, "{tracked} of 80 frames");
-    let poses = read_tum(&told.join("trajectory.tum")).unwrap();
+    let poses = read_tum(&reported.join("trajectory.tum")).unwrap();
     assert!(poses.len() as u64 >= tracked);
-    assert!(told.join("frames.csv").exists() && told.join("localisation.json").exists());
+    assert!(reported.join("frames.csv").exists() && reported.join("localisation.json").exists());
     assert_eq!(
         std::fs::read(&splatmap).unwrap(),
         before,

@@ -1,28 +1,28 @@
-//! Places seen again: the way between is corrected, and components join.
+//! Places seen again: the way between is corrected, and submaps join.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::align::AlignParams;
-use splat_mapper::eval::align::align;
-use splat_mapper::eval::image_metrics;
-use splat_mapper::frame::{Batch, Frame, Keyframe, RgbImage};
-use splat_mapper::geometry::align::Aligner;
-use splat_mapper::geometry::align::noise::{Noise, answer};
-use splat_mapper::geometry::sfm::Sfm;
-use splat_mapper::geometry::{GeometryBatch, Health, View};
-use splat_mapper::map::SplatMap;
-use splat_mapper::map::correction::{Correction, Reason};
-use splat_mapper::map::schedule::Phase;
-use splat_mapper::map::snapshot::Scale;
-use splat_mapper::pose::Rigid;
-use splat_mapper::source::synthetic::SynthSettings;
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::splat::cpu::CpuEngine;
-
 use crate::sfm::params;
+use splat_engine::cpu::engine::CpuEngine;
+use splat_geometry::alignment::aligner::Aligner;
+use splat_geometry::alignment::params::AlignParams;
+use splat_geometry::answer::{GeometryBatch, PoseQuality, View};
+use splat_geometry::ground_truth::noise::{Noise, answer};
+use splat_geometry::sfm::estimator::Sfm;
+use splat_mapper::eval::alignment::align;
+use splat_mapper::eval::image_metrics;
+use splat_slam::mapper::mapper::Mapper;
+use splat_slam::mapper::train::schedule::Phase;
+use splat_synth::settings::SynthSettings;
+use splat_synth::take::Take;
+use splat_types::camera::Intrinsics;
+use splat_types::correction::{MapCorrection, Reason};
+use splat_types::frame::{Batch, Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::snapshot::Scale;
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::Rigid;
 
 /// Of the error without loops, what may be left with them.
 const MAX_LEFT: f64 = 0.3;
@@ -46,7 +46,7 @@ pub(crate) struct Filmed {
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
 }
 
-/// Every `stride`-th frame; the pictures of a calibrated camera.
+/// Every `stride`-th frame; the images of a calibrated camera.
 pub(crate) fn film(scene: &str, stride: u32) -> Filmed {
     let settings = SynthSettings::parse(scene).unwrap();
     let (n, lens): (u32, Intrinsics) = (settings.n_frames, settings.lens().intrinsics);
@@ -61,11 +61,11 @@ pub(crate) fn film(scene: &str, stride: u32) -> Filmed {
         let frame = Frame {
             seq: u64::from(id),
             stamp: Stamp::from_secs(f64::from(ix) / 10.0),
-            image: Arc::new(take.picture(ix)),
+            image: Arc::new(take.image(ix)),
             intrinsics: Some(lens),
             truth: None,
             odometry: None,
-            truth_depth: None,
+            sensor_depth: None,
             is_held_out: false,
         };
         filmed.keyframes.push(Arc::new(Keyframe {
@@ -75,12 +75,12 @@ pub(crate) fn film(scene: &str, stride: u32) -> Filmed {
         }));
         filmed.views.push(View {
             keyframe_id: id,
-            component: 0,
+            submap: 0,
             intrinsics: lens,
             lens: None,
-            batch_from_cam: take.pose(ix),
+            submap_from_cam: take.pose(ix),
             depth: take.depth(ix, &half),
-            health: Health::default(),
+            health: PoseQuality::default(),
         });
     }
     filmed
@@ -91,13 +91,13 @@ struct Found {
     /// Of the extent.
     ate_percent: f64,
     n_loops: usize,
-    n_components: usize,
+    n_submaps: usize,
 }
 
 fn judged(filmed: &Filmed, poses: &BTreeMap<u32, (u32, Rigid)>, n_loops: usize) -> Found {
     let truth: Vec<Rigid> = poses
         .keys()
-        .map(|id| filmed.views[*id as usize].batch_from_cam)
+        .map(|id| filmed.views[*id as usize].submap_from_cam)
         .collect();
     let found: Vec<Rigid> = poses.values().map(|p| p.1).collect();
     let similarity = align(&found, &truth).unwrap().reference_from_estimate;
@@ -109,13 +109,13 @@ fn judged(filmed: &Filmed, poses: &BTreeMap<u32, (u32, Rigid)>, n_loops: usize) 
     });
     let rms = (squares.sum::<f64>() / truth.len() as f64).sqrt();
     let places: Vec<_> = truth.iter().map(|t| t.translation).collect();
-    let mut components: Vec<u32> = poses.values().map(|p| p.0).collect();
-    components.sort_unstable();
-    components.dedup();
+    let mut submaps: Vec<u32> = poses.values().map(|p| p.0).collect();
+    submaps.sort_unstable();
+    submaps.dedup();
     Found {
-        ate_percent: 100.0 * rms / splat_mapper::pose::extent(&places),
+        ate_percent: 100.0 * rms / splat_types::transform::extent(&places),
         n_loops,
-        n_components: components.len(),
+        n_submaps: submaps.len(),
     }
 }
 
@@ -140,24 +140,24 @@ fn windows(
         let from = if breaks.contains(&n) { from + 2 } else { from };
         let range = from..(from / 6 * 6 + 8).min(filmed.views.len());
         let window = answer(&filmed.views[range.clone()], noise, seed << 20 | n as u64);
-        let pictures: BTreeMap<u32, Arc<RgbImage>> = filmed.keyframes[range]
+        let images: BTreeMap<u32, Arc<RgbImage>> = filmed.keyframes[range]
             .iter()
             .map(|k| (k.id, Arc::clone(&k.frame.image)))
             .collect();
-        let joined = aligner.place(window, &pictures, true);
+        let joined = aligner.place(window, &images, true);
         n_loops += usize::from(joined.is_loop);
         let views = joined
             .views
             .iter()
-            .map(|v| (v.keyframe_id, (v.component, v.batch_from_cam)));
+            .map(|v| (v.keyframe_id, (v.submap, v.submap_from_cam)));
         poses.extend(views);
         let revised = joined.revised.iter();
-        poses.extend(revised.map(|r| (r.keyframe_id, (r.component, r.batch_from_cam))));
+        poses.extend(revised.map(|r| (r.keyframe_id, (r.submap, r.submap_from_cam))));
     }
     let last = aligner.finish();
     poses.extend(
         last.iter()
-            .map(|r| (r.keyframe_id, (r.component, r.batch_from_cam))),
+            .map(|r| (r.keyframe_id, (r.submap, r.submap_from_cam))),
     );
     judged(filmed, &poses, n_loops)
 }
@@ -173,15 +173,15 @@ fn sfm(filmed: &Filmed, changes: &[&str], seed: u64) -> Found {
         n_shared: 0,
         keyframes: all[from..(from + 5).min(all.len())].to_vec(),
     });
-    let mut take = |sparse: splat_mapper::geometry::sfm::SparseBatch| {
+    let mut take = |sparse: splat_geometry::sfm::updates::SparseBatch| {
         n_loops += usize::from(sparse.is_loop);
         let views = sparse
             .views
             .iter()
-            .map(|v| (v.keyframe_id, (v.component, v.batch_from_cam)));
+            .map(|v| (v.keyframe_id, (v.submap, v.submap_from_cam)));
         poses.extend(views);
         let revised = sparse.revised.iter();
-        poses.extend(revised.map(|r| (r.keyframe_id, (r.component, r.batch_from_cam))));
+        poses.extend(revised.map(|r| (r.keyframe_id, (r.submap, r.submap_from_cam))));
     };
     for batch in batches {
         take(sfm.sparse(&batch));
@@ -209,7 +209,7 @@ fn a_loop_of_windows_takes_most_of_the_drift() {
         let (without, with) = (run(false, noise, seed), run(true, noise, seed));
         eprintln!("{noise:?}: {without:?} -> {with:?}");
         assert_eq!(without.n_loops, 0);
-        assert!(with.n_loops > 0 && with.n_components == 1, "{with:?}");
+        assert!(with.n_loops > 0 && with.n_submaps == 1, "{with:?}");
         (before, after) = (before + without.ate_percent, after + with.ate_percent);
     }
     let left = after / before;
@@ -217,7 +217,7 @@ fn a_loop_of_windows_takes_most_of_the_drift() {
 }
 
 #[test]
-fn a_component_that_sees_a_known_place_joins_it() {
+fn a_submap_that_sees_a_known_place_joins_it() {
     let filmed = film(CORRIDOR, 2);
     let base = params(&[]).align;
     let run = |loops: bool| {
@@ -229,20 +229,20 @@ fn a_component_that_sees_a_known_place_joins_it() {
     };
     let (without, with) = (run(false), run(true));
     eprintln!("broken: {without:?} -> {with:?}");
-    assert_eq!(without.n_components, 2);
-    assert_eq!(with.n_components, 1);
+    assert_eq!(without.n_submaps, 2);
+    assert_eq!(with.n_submaps, 1);
     assert!(with.ate_percent < 1.0, "{with:?}");
 }
 
 #[test]
-fn a_loop_of_pictures_alone_takes_most_of_the_drift() {
+fn a_loop_of_images_alone_takes_most_of_the_drift() {
     let filmed = film(CORRIDOR, 2);
     let small = "sfm.max_features=600";
     let without = sfm(&filmed, &[small, "sfm.loops=false"], 1);
     let with = sfm(&filmed, &[small], 1);
     eprintln!("sfm: {without:?} -> {with:?}");
     assert_eq!(without.n_loops, 0);
-    assert!(with.n_loops > 0 && with.n_components == 1, "{with:?}");
+    assert!(with.n_loops > 0 && with.n_submaps == 1, "{with:?}");
     let left = with.ate_percent / without.ate_percent;
     assert!(left <= MAX_LEFT, "{left:.2} of the error is left");
 }
@@ -258,29 +258,29 @@ fn a_hallway_of_equal_bays_is_not_taken_for_a_loop() {
         let align = params(&[]).align;
         let found = windows(&filmed, &align, (1200, &Noise::STATED), seed, &[]);
         eprintln!("hallway {seed}: windows {found:?}");
-        assert_eq!((found.n_loops, found.n_components), (0, 1));
+        assert_eq!((found.n_loops, found.n_submaps), (0, 1));
         // Taking one bay for the next makes it a third.
         assert!(found.ate_percent < 10.0, "{found:?}");
         // Where a part of the way was not seen, its ends join only if they fit.
         let broken = windows(&filmed, &align, (1200, &Noise::STATED), seed, &[4]);
         eprintln!("broken: {broken:?}");
         assert_eq!(broken.n_loops, 0);
-        assert!(broken.n_components > 1, "{broken:?}");
+        assert!(broken.n_submaps > 1, "{broken:?}");
     }
     let filmed = film("hallway?frames=110&width=160&height=120", 2);
     let found = sfm(&filmed, &["sfm.max_features=1200"], 0);
-    eprintln!("pictures alone: {found:?}");
+    eprintln!("images alone: {found:?}");
     assert_eq!(found.n_loops, 0);
 }
 
-/// Held-out PSNR where the lap ends over where it began, and elsewhere; corrections that were told.
-fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<Correction>) {
-    let all = params(&["map.seeds_per_keyframe=1200", "map.max_splats=40000"]);
+/// Held-out PSNR where the lap ends over where it began, and elsewhere; corrections that were reported.
+fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<MapCorrection>) {
+    let all = params(&["train.seeds_per_keyframe=1200", "map.max_splats=40000"]);
     let mut sfm = all.sfm.clone();
     sfm.max_features = 500;
     let mut aligner = Aligner::new(align, &sfm, 1).unwrap();
     let engine = Box::new(CpuEngine::new());
-    let mut map = SplatMap::new(all.map.clone(), 1, Scale::UP_TO_SCALE, engine);
+    let mut map = Mapper::new(all.mapper(), 1, Scale::UP_TO_SCALE, engine);
     let mut corrections = Vec::new();
     for (n, from) in (0..filmed.views.len().saturating_sub(7))
         .step_by(6)
@@ -289,8 +289,8 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<Correction>) {
         let range = from..from + 8;
         let window = answer(&filmed.views[range.clone()], &Noise::STATED, n as u64);
         let keyframes = filmed.keyframes[range].to_vec();
-        let pictures = keyframes.iter().map(|k| (k.id, Arc::clone(&k.frame.image)));
-        let joined = aligner.place(window, &pictures.collect(), true);
+        let images = keyframes.iter().map(|k| (k.id, Arc::clone(&k.frame.image)));
+        let joined = aligner.place(window, &images.collect(), true);
         let geometry = GeometryBatch {
             batch_id: n as u32,
             views: joined.views,
@@ -303,19 +303,19 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<Correction>) {
             n_shared: if n == 0 { 0 } else { 2 },
             keyframes,
         };
-        map.add(Some(&batch), geometry, None);
-        map.step(30, Phase::Streaming);
+        map.add(Some(&batch), &geometry, None).unwrap();
+        map.step(30, Phase::Streaming).unwrap();
         corrections.extend(map.take_correction());
     }
     let last = GeometryBatch {
         revised: aligner.finish(),
         ..GeometryBatch::default()
     };
-    map.add(None, last, None);
+    map.add(None, &last, None).unwrap();
     for step in 0..60 {
-        map.step(10, Phase::Final(step as f32 / 60.0));
+        map.step(10, Phase::Final(step as f32 / 60.0)).unwrap();
     }
-    map.refine_held_out();
+    map.refine_held_out().unwrap();
     let (mut seam, mut elsewhere) = (Vec::new(), Vec::new());
     let end = filmed.keyframes.len() as u32;
     for (id, _) in map
@@ -323,7 +323,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<Correction>) {
         .into_iter()
         .filter(|(_, held_out)| *held_out)
     {
-        let (rendering, photo) = map.render_keyframe(id).unwrap();
+        let (rendering, photo) = map.render_keyframe(id).unwrap().unwrap();
         let psnr = image_metrics::psnr(&rendering.rgb, &photo);
         if id < SEAM || id + SEAM >= end {
             &mut seam
@@ -337,7 +337,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<Correction>) {
 }
 
 #[test]
-fn held_out_pictures_at_the_seam_are_as_good_as_elsewhere() {
+fn held_out_images_at_the_seam_are_as_good_as_elsewhere() {
     let filmed = film(CORRIDOR, 2);
     let base = params(&[]).align;
     let (seam, elsewhere, corrections) = mapped(&filmed, &base);

@@ -3,14 +3,13 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use splat_mapper::eval::lpips::Lpips;
-use splat_mapper::frame::RgbImage;
-
 use crate::graphs::{self, INPUT, OUTPUT, int, library, node, tensor};
+use splat_mapper::eval::lpips::Lpips;
+use splat_types::image::RgbImage;
 
 const ROOM: &str = "synthetic:room?frames=12&width=96&height=72&speed=3";
 
-/// Mean of |a - b| over `inputs` pictures named a, b, ...: with one input, of |a|.
+/// Mean of |a - b| over `inputs` images named a, b, ...: with one input, of |a|.
 pub(crate) fn network(inputs: &[&str]) -> Vec<u8> {
     let mut graph = match inputs {
         [one] => node("Abs", &[one], "size", &[]),
@@ -35,7 +34,7 @@ pub(crate) fn saved(folder: &Path, content: &[u8]) -> PathBuf {
 }
 
 #[test]
-fn a_network_of_two_pictures_gives_their_distance() {
+fn a_network_of_two_images_gives_their_distance() {
     let Some(library) = library() else { return };
     let folder = tempfile::tempdir().unwrap();
     let model = saved(folder.path(), &network(&["shown", "seen"]));
@@ -70,7 +69,7 @@ fn replay(model: &str, library: Option<&Path>, out: &Path) -> Output {
             "replay",
             ROOM,
             "--geometry",
-            "known",
+            "ground_truth",
             "--steps",
             "20",
             "--set",

@@ -4,48 +4,49 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::{DMat3, DVec2, DVec3};
-use splat_mapper::frame::{Batch, Keyframe};
-use splat_mapper::geometry::sfm::Sfm;
-use splat_mapper::geometry::{GeometryModel, View};
-use splat_mapper::pose::Rigid;
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
 
-use crate::hard_pictures::{hall, stroll};
+use crate::hard_images::{hall, stroll};
 use crate::hard_world::{Flaws, LENS, Paint, depth, film};
 use crate::scenes::scene;
 use crate::sfm::{Shown, keyframe, params, shown};
+use splat_geometry::answer::View;
+use splat_geometry::model::GeometryModel;
+use splat_geometry::sfm::estimator::Sfm;
+use splat_synth::settings::{SceneKind, SynthSettings};
+use splat_synth::take::Take;
+use splat_types::frame::{Batch, Keyframe};
+use splat_types::transform::Rigid;
 
 /// What the model has said of each keyframe at the end, and where keyframes saw which landmark.
-struct Told {
+struct Given {
     views: BTreeMap<u32, View>,
-    sightings: BTreeMap<u32, Vec<(u32, DVec2)>>,
+    observations: BTreeMap<u32, Vec<(u32, DVec2)>>,
 }
 
-fn told(shown: &Shown, changes: &[&str]) -> Told {
+fn reported(shown: &Shown, changes: &[&str]) -> Given {
     let params = params(changes);
     let mut sfm = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
-    let mut told = Told {
+    let mut reported = Given {
         views: BTreeMap::new(),
-        sightings: BTreeMap::new(),
+        observations: BTreeMap::new(),
     };
-    let mut take = |batch: splat_mapper::geometry::GeometryBatch| {
+    let mut take = |batch: splat_geometry::answer::GeometryBatch| {
         for view in batch.views {
-            told.views.insert(view.keyframe_id, view);
+            reported.views.insert(view.keyframe_id, view);
         }
         for revision in batch.revised {
-            let Some(view) = told.views.get_mut(&revision.keyframe_id) else {
+            let Some(view) = reported.views.get_mut(&revision.keyframe_id) else {
                 continue;
             };
-            view.batch_from_cam = revision.batch_from_cam;
+            view.submap_from_cam = revision.submap_from_cam;
             view.intrinsics = revision.intrinsics;
         }
-        for seen in batch.sightings {
+        for seen in batch.observations {
             let landmarks = seen.landmarks.iter();
             let landmarks = landmarks
                 .map(|(id, p)| (*id, DVec2::new(f64::from(p[0]), f64::from(p[1]))))
                 .collect();
-            told.sightings.insert(seen.keyframe_id, landmarks);
+            reported.observations.insert(seen.keyframe_id, landmarks);
         }
     };
     for (id, keyframes) in batches(&shown.keyframes, 8, 3).into_iter().enumerate() {
@@ -57,7 +58,7 @@ fn told(shown: &Shown, changes: &[&str]) -> Told {
         take(sfm.infer(&batch).unwrap());
     }
     take(sfm.finish().unwrap());
-    told
+    reported
 }
 
 fn batches(keyframes: &[Arc<Keyframe>], size: usize, shared: usize) -> Vec<Vec<Arc<Keyframe>>> {
@@ -70,13 +71,13 @@ fn batches(keyframes: &[Arc<Keyframe>], size: usize, shared: usize) -> Vec<Vec<A
 /// Errors of the kept pixels, relative, sorted; and the share of pixels kept. `truth` gives the exact depth of a
 /// keyframe at a size.
 fn against_truth(
-    told: &Told,
+    reported: &Given,
     shown: &Shown,
     truth: &dyn Fn(u32, [u32; 2]) -> Vec<f64>,
 ) -> (Vec<f64>, f64) {
-    let scale = scale_of(told, shown);
+    let scale = scale_of(reported, shown);
     let (mut errors, mut all) = (Vec::new(), 0);
-    for (id, view) in &told.views {
+    for (id, view) in &reported.views {
         let truth = truth(*id, [view.depth.width_px, view.depth.height_px]);
         all += truth.len();
         for (q, truth) in truth.into_iter().enumerate() {
@@ -92,40 +93,40 @@ fn against_truth(
 }
 
 /// Metres per unit: mean distance of the cameras from their mean, true and found.
-fn scale_of(told: &Told, shown: &Shown) -> f64 {
+fn scale_of(reported: &Given, shown: &Shown) -> f64 {
     let spread = |places: Vec<DVec3>| {
         let mean = places.iter().sum::<DVec3>() / places.len() as f64;
         places.iter().map(|p| p.distance(mean)).sum::<f64>()
     };
-    let truth = told.views.keys().map(|id| shown.truth[*id as usize]);
-    let found = told.views.values().map(|view| view.batch_from_cam);
+    let truth = reported.views.keys().map(|id| shown.truth[*id as usize]);
+    let found = reported.views.values().map(|view| view.submap_from_cam);
     spread(truth.map(|p| p.translation).collect()) / spread(found.map(|p| p.translation).collect())
 }
 
 /// Errors of the depth maps at the landmarks, which are triangulated here from where they were seen.
-fn against_landmarks(told: &Told) -> Vec<f64> {
+fn against_landmarks(reported: &Given) -> Vec<f64> {
     let mut seen: BTreeMap<u32, Vec<(u32, DVec2)>> = BTreeMap::new();
-    for (id, landmarks) in &told.sightings {
+    for (id, landmarks) in &reported.observations {
         for (landmark, pixel) in landmarks {
             seen.entry(*landmark).or_default().push((*id, *pixel));
         }
     }
     let mut errors = Vec::new();
-    for sights in seen.values().filter(|sights| sights.len() >= 3) {
-        let rays: Vec<(DVec3, DVec3)> = sights
+    for observations in seen.values().filter(|observations| observations.len() >= 3) {
+        let rays: Vec<(DVec3, DVec3)> = observations
             .iter()
             .map(|(id, pixel)| {
-                let view = &told.views[id];
-                let direction = view.batch_from_cam.rotation * view.intrinsics.ray_in_cam(*pixel);
-                (view.batch_from_cam.translation, direction.normalize())
+                let view = &reported.views[id];
+                let direction = view.submap_from_cam.rotation * view.intrinsics.ray_in_cam(*pixel);
+                (view.submap_from_cam.translation, direction.normalize())
             })
             .collect();
         let Some(point) = nearest_point(&rays) else {
             continue;
         };
-        for (id, pixel) in sights {
-            let view = &told.views[id];
-            let own = view.batch_from_cam.inverse().transform_point(point).z;
+        for (id, pixel) in observations {
+            let view = &reported.views[id];
+            let own = view.submap_from_cam.inverse().transform_point(point).z;
             let (w, h) = (view.depth.width_px, view.depth.height_px);
             let x = (pixel.x / f64::from(view.intrinsics.width_px) * f64::from(w)) as u32;
             let y = (pixel.y / f64::from(view.intrinsics.height_px) * f64::from(h)) as u32;
@@ -176,7 +177,7 @@ fn holds(name: &str, (errors, kept): (Vec<f64>, f64), [least, far_off]: [f64; 2]
 #[test]
 fn a_hall_is_measured_to_half_a_percent() {
     let shown = film(&hall(Paint::Varied), &stroll(), Flaws::default(), LENS);
-    let told = told(&shown, &["sfm.max_side=400", "sfm.max_features=1000"]);
+    let reported = reported(&shown, &["sfm.max_side=400", "sfm.max_features=1000"]);
     let truth = |id: u32, [w, h]: [u32; 2]| {
         depth(
             &hall(Paint::Varied),
@@ -184,11 +185,15 @@ fn a_hall_is_measured_to_half_a_percent() {
             &LENS.resized(w, h),
         )
     };
-    holds("hall", against_truth(&told, &shown, &truth), [0.75, 0.02]);
+    holds(
+        "hall",
+        against_truth(&reported, &shown, &truth),
+        [0.75, 0.02],
+    );
 }
 
 #[test]
-fn made_up_scenes_are_measured_to_half_a_percent() {
+fn synthetic_scenes_are_measured_to_half_a_percent() {
     for (scene, bounds) in [
         (SceneKind::Facade, [0.8, 0.01]),
         (SceneKind::Room, [0.7, 0.02]),
@@ -204,19 +209,19 @@ fn made_up_scenes_are_measured_to_half_a_percent() {
         let lens = take.settings().lens().intrinsics;
         let ids: Vec<u32> = (0..12).map(|i| 3 * i).collect();
         let keyframes = ids.iter().enumerate().map(|(id, ix)| {
-            let picture = take.picture(*ix);
-            let image = image::RgbImage::from_raw(480, 360, picture.pixels).unwrap();
+            let rgb_image = take.image(*ix);
+            let image = image::RgbImage::from_raw(480, 360, rgb_image.pixels).unwrap();
             keyframe(id as u32, f64::from(*ix), &image, 480, &lens, true)
         });
         let shown = Shown {
             keyframes: keyframes.collect(),
             truth: ids.iter().map(|ix| take.pose(*ix)).collect(),
         };
-        let told = told(&shown, &["sfm.max_side=480", "sfm.max_features=1000"]);
+        let reported = reported(&shown, &["sfm.max_side=480", "sfm.max_features=1000"]);
         assert!(
-            told.views.len() >= 11,
-            "{scene:?}: {} placed",
-            told.views.len()
+            reported.views.len() >= 11,
+            "{scene:?}: {} registered",
+            reported.views.len()
         );
         let truth = |id: u32, [w, h]: [u32; 2]| {
             let depth = take.depth(ids[id as usize], &lens.resized(w, h)).depth;
@@ -224,7 +229,7 @@ fn made_up_scenes_are_measured_to_half_a_percent() {
         };
         holds(
             &format!("{scene:?}"),
-            against_truth(&told, &shown, &truth),
+            against_truth(&reported, &shown, &truth),
             bounds,
         );
     }
@@ -234,16 +239,16 @@ fn made_up_scenes_are_measured_to_half_a_percent() {
 fn three_quarters_of_the_fox_are_kept_and_fit_its_landmarks() {
     let Some(folder) = scene("fox") else { return };
     let shown = shown(&folder, 640, 1, true);
-    let told = told(&shown, &[]);
-    let errors = against_landmarks(&told);
-    let (kept, all) = told.views.values().fold((0, 0), |(kept, all), view| {
+    let reported = reported(&shown, &[]);
+    let errors = against_landmarks(&reported);
+    let (kept, all) = reported.views.values().fold((0, 0), |(kept, all), view| {
         let n = view.depth.confidence.iter().filter(|c| **c > 0.0).count();
         (kept + n, all + view.depth.confidence.len())
     });
     let kept = kept as f64 / f64::from(all as u32);
     let median = quantile(&errors, 0.5);
     eprintln!(
-        "fox: kept {kept:.3}, median {median:.5} of {} sightings",
+        "fox: kept {kept:.3}, median {median:.5} of {} observations",
         errors.len()
     );
     assert!(

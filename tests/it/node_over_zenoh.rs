@@ -3,13 +3,12 @@
 
 use std::process::{Child, Command, Stdio};
 
-use splat_mapper::export::ply;
-use splat_mapper::map::snapshot::Snapshot;
-use splat_mapper::publish::assemble::Assembler;
-
 use zenoh::Wait;
 
 use crate::over_zenoh::{MAX_BYTES, PATIENCE, ask, client, free_endpoint, take};
+use splat_msgs::client::assembler::Assembler;
+use splat_types::snapshot::Snapshot;
+use splat_types::splats::ply;
 
 /// Ends the node with the test, whatever happens.
 struct Node(Child);
@@ -35,7 +34,7 @@ fn early_and_late_subscribers_get_the_map_of_the_run_directory() {
             "replay",
             "synthetic:room?frames=12&width=160&height=120&speed=3",
             "--geometry",
-            "known",
+            "ground_truth",
         ])
         .args([
             "--steps",
@@ -49,9 +48,9 @@ fn early_and_late_subscribers_get_the_map_of_the_run_directory() {
             "--set",
             "publish.scouting=false",
             "--set",
-            "publish.linger_secs=120",
+            "publish.shutdown_delay=120",
         ])
-        .args(["--set", "publish.full_secs=0"])
+        .args(["--set", "publish.full_map_period=0"])
         .args(["--set", &format!("publish.zenoh_listen={node_end}")])
         .args(["--set", &format!("publish.zenoh_connect={early_end}")])
         .stdout(Stdio::null())
@@ -60,7 +59,7 @@ fn early_and_late_subscribers_get_the_map_of_the_run_directory() {
         .unwrap();
     let _node = Node(child);
 
-    // The early one hears every revision; the newest is whole when the run directory is.
+    // The early one receives every revision; the newest is whole when the run directory is.
     let mut assembler = Assembler::new(MAX_BYTES);
     let mut newest: Option<Snapshot> = None;
     let map = folder.path().join("map.ply");
@@ -83,7 +82,7 @@ fn early_and_late_subscribers_get_the_map_of_the_run_directory() {
 }
 
 /// Splat for splat; anchors do not travel in PLY.
-fn same(file: &splat_mapper::splat::Splats, snapshot: &Snapshot) -> bool {
+fn same(file: &splat_types::splats::splats::Splats, snapshot: &Snapshot) -> bool {
     let sent = &snapshot.splats;
     file.means == sent.means
         && file.log_scales == sent.log_scales

@@ -6,24 +6,26 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use serde_json::json;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::frame::{Batch, Frame, Keyframe, RgbImage};
-use splat_mapper::geometry::onnx::Foundation;
-use splat_mapper::geometry::onnx::decode::Answer;
-use splat_mapper::geometry::{GeometryBatch, GeometryModel as _};
 
 use crate::graphs::library;
 use crate::onnx_models::{
     CONFIDENCE_WEIGHTS, Computing, DEPTH_WEIGHTS, POSE_BIAS, POSE_WEIGHTS, description, open,
     params, saved,
 };
+use splat_geometry::answer::GeometryBatch;
+use splat_geometry::foundation::decode::Answer;
+use splat_geometry::foundation::estimator::FoundationModel;
+use splat_geometry::model::GeometryModel as _;
+use splat_types::frame::{Batch, Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
 
 const WIDTH: usize = 42;
 const HEIGHT: usize = 28;
 /// f32 sums of a few numbers in another order.
 const CLOSE: f32 = 1e-5;
 
-fn pictures(n: usize) -> Vec<f32> {
+fn images(n: usize) -> Vec<f32> {
     let value = |i: usize| 0.5 + 0.4 * ((i % 1009) as f32 * 0.37).sin();
     (0..n * 3 * WIDTH * HEIGHT).map(value).collect()
 }
@@ -78,7 +80,7 @@ fn a_model_of_the_contract_answers_for_any_number_of_frames() {
         description["input_norm"] = norm.into();
         let mut model = open(&library, &saved(folder.path(), &bytes, &description)).unwrap();
         for n in [1, 2, 3, 7] {
-            let images = pictures(n);
+            let images = images(n);
             let mut seen = images.clone();
             if norm == "imagenet" {
                 let scale = [(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)];
@@ -239,7 +241,7 @@ fn a_provider_that_is_not_there_is_passed_over_unless_it_is_the_only_one() {
     );
     let by = |providers: &str| {
         let setting = format!("onnx.providers={providers}");
-        splat_mapper::geometry::onnx::model::Model::open_by(&library, &path, &params(&[&setting]))
+        splat_geometry::foundation::model::Model::open_by(&library, &path, &params(&[&setting]))
             .map(|model| model.provider().name())
             .map_err(|e| e.to_string())
     };
@@ -271,7 +273,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
             intrinsics: None,
             truth: None,
             odometry: None,
-            truth_depth: None,
+            sensor_depth: None,
             is_held_out: false,
         };
         Arc::new(Keyframe {
@@ -287,7 +289,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
     }
 }
 
-fn foundation(library: &Path, broken: &Computing) -> Foundation {
+fn foundation(library: &Path, broken: &Computing) -> FoundationModel {
     let folder = tempfile::tempdir().unwrap();
     let path = saved(folder.path(), &broken.bytes(), &description(42, 28, 14));
     crate::onnx_models::foundation(open(library, &path).unwrap(), &[])
@@ -295,7 +297,7 @@ fn foundation(library: &Path, broken: &Computing) -> Foundation {
 
 fn assert_finite(geometry: &GeometryBatch) {
     for view in &geometry.views {
-        assert!(view.batch_from_cam.is_finite() && view.intrinsics.is_plausible());
+        assert!(view.submap_from_cam.is_finite() && view.intrinsics.is_plausible());
         let mut values = view.depth.depth.iter().chain(&view.depth.confidence);
         assert!(values.all(|v| v.is_finite() && *v >= 0.0));
     }
@@ -335,12 +337,12 @@ fn a_window_without_poses_is_dropped_and_what_follows_is_joined_over_the_gap() {
     assert_finite(&after);
     assert_eq!(after.views.len(), 4);
     for (old, new) in first.iter().zip(&after.views) {
-        let shift: DVec3 = old.batch_from_cam.translation - new.batch_from_cam.translation;
+        let shift: DVec3 = old.submap_from_cam.translation - new.submap_from_cam.translation;
         assert!(
             shift.length() < 1e-5,
-            "equal pictures have equal places: {shift}"
+            "equal images have equal places: {shift}"
         );
-        assert_eq!(new.component, 0);
+        assert_eq!(new.submap, 0);
     }
 }
 

@@ -5,18 +5,19 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde_json::{Value, json};
-use splat_mapper::config::Settings;
-use splat_mapper::config::onnx::OnnxParams;
-use splat_mapper::frame::{DepthMap, Frame};
-use splat_mapper::geometry::align::Aligner;
-use splat_mapper::geometry::onnx::Foundation;
-use splat_mapper::geometry::onnx::model::Model;
-use splat_mapper::geometry::onnx::preprocess::Fit;
-use splat_mapper::pose::Rigid;
 
 use crate::graphs::{
     INPUT, OUTPUT, floats, int, ints, model, node, tensor, tensor_of, whole_numbers,
 };
+use splat_geometry::alignment::aligner::Aligner;
+use splat_geometry::foundation::estimator::FoundationModel;
+use splat_geometry::foundation::model::Model;
+use splat_geometry::foundation::params::OnnxParams;
+use splat_geometry::foundation::preprocess::Fit;
+use splat_mapper::params::settings::Settings;
+use splat_types::depth::DepthMap;
+use splat_types::frame::Frame;
+use splat_types::transform::Rigid;
 
 /// Weights from the mean red, green and blue of a frame to its pose, and what is added.
 pub const POSE_WEIGHTS: [[f32; 9]; 3] = [
@@ -70,7 +71,7 @@ impl Computing {
             node("Log", &["mean"], "log", &[]),
             node("MatMul", &["log", "zeros"], "nothing", &[]),
             node("MatMul", &["mean", "pose_weights"], "moved", &[]),
-            node("Add", &["moved", "pose_bias"], "placed", &[]),
+            node("Add", &["moved", "pose_bias"], "registered", &[]),
             node("Conv", &[images, "depth_weights"], "log_depth", &[]),
             node("Exp", &["log_depth"], "depths", &[]),
             node("Squeeze", &["depths", "one"], depth, &[]),
@@ -99,7 +100,7 @@ impl Computing {
         } else {
             (pose_enc, 1)
         };
-        parts.push(node("Add", &["placed", "nothing"], sum, &[]));
+        parts.push(node("Add", &["registered", "nothing"], sum, &[]));
         if self.pose_is_f64 {
             parts.push(node("Cast", &[sum], pose_enc, &int("to", 11)));
         }
@@ -139,19 +140,19 @@ pub fn params(settings: &[&str]) -> OnnxParams {
 }
 
 /// The model with the shipped parameters after these settings.
-pub fn foundation(model: Model, settings: &[&str]) -> Foundation {
+pub fn foundation(model: Model, settings: &[&str]) -> FoundationModel {
     let mut all = Settings::shipped();
     settings.iter().for_each(|s| all.merge_setting(s).unwrap());
     let params = all.params().unwrap();
     let aligner = Aligner::new(&params.align, &params.sfm, params.seed).unwrap();
-    Foundation::of(model, &params.onnx, aligner)
+    FoundationModel::of(model, &params.onnx, aligner, None)
 }
 
 pub fn open(library: &Path, path: &Path) -> Result<Model, String> {
     Model::open_by(library, path, &params(&[])).map_err(|e| e.to_string())
 }
 
-/// Side of the cells whose mean colours tell one frame from another.
+/// Side of the cells whose mean colours distinguish one frame from another.
 const CELL: usize = 8;
 
 /// Mean of every cell of every plane: what `AveragePool` gives.
@@ -168,12 +169,12 @@ fn signature(planes: &[f32], width: usize, height: usize) -> Vec<f32> {
     means
 }
 
-/// A model that answers with the true pose and depth of the frame that its picture looks most like. Its pictures have
+/// A model that answers with the true pose and depth of the frame that its image looks most like. Its images have
 /// the size of the depth that the frames carry.
 pub fn truthful(folder: &Path, frames: &[Frame]) -> PathBuf {
     let depths: Vec<Arc<DepthMap>> = frames
         .iter()
-        .filter_map(|f| f.truth_depth.clone())
+        .filter_map(|f| f.sensor_depth.clone())
         .collect();
     assert_eq!(depths.len(), frames.len());
     let (w, h) = (depths[0].width_px as usize, depths[0].height_px as usize);

@@ -4,16 +4,17 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use serde_json::Value;
-use splat_mapper::config::Settings;
-use splat_mapper::eval::trajectory::{TimedPose, read_tum};
-use splat_mapper::frame::Frame;
-use splat_mapper::geometry::{GeometryModel as _, View};
-use splat_mapper::pose::{Rigid, extent};
-use splat_mapper::source;
 
 use crate::graphs::library;
-use crate::known::{batch, numbered};
+use crate::ground_truth::{batch, numbered};
 use crate::onnx_models::{Computing, description, foundation, open, saved, truthful};
+use splat_geometry::answer::View;
+use splat_geometry::model::GeometryModel as _;
+use splat_mapper::eval::trajectory::{TimedPose, read_tum};
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_types::frame::Frame;
+use splat_types::transform::{Rigid, extent};
 
 const DEMO: &str = "recordings/demo.mcap";
 /// f32 poses, and f32 depths whose ratio gives the scale.
@@ -21,7 +22,7 @@ const MAX_OFF: f64 = 1e-4;
 
 fn demo() -> Vec<Frame> {
     let params = Settings::shipped().params().unwrap().source;
-    let mut source = source::open(DEMO, &params, 0).unwrap();
+    let mut source = open_source::open(DEMO, &params, 0).unwrap();
     std::iter::from_fn(|| source.next()).collect()
 }
 
@@ -41,11 +42,11 @@ fn replayed(library: &Path, geometry: &str, out: &Path) -> (Vec<TimedPose>, Valu
     let args = ["replay", DEMO, "--geometry", geometry, "--out", out_dir];
     let few = ["--backend", "cpu", "--steps", "10", "--holdout", "0"];
     let settings = [
-        "map.pose=held",
+        "train.pose_opt=fixed",
         // Exact poses can only get worse.
         "align.method=off",
-        "map.max_side=160",
-        "map.seeds_per_keyframe=100",
+        "train.max_side=160",
+        "train.seeds_per_keyframe=100",
         "mvs.backend=cpu",
     ];
     let settings = settings.iter().flat_map(|s| ["--set", s]);
@@ -85,7 +86,7 @@ fn a_model_that_knows_the_truth_maps_the_demo_as_known_poses_do() {
     let model = truthful(folder.path(), &demo());
     let geometry = format!("onnx:{}", model.display());
     let (by_model, report) = replayed(&library, &geometry, &folder.path().join("onnx"));
-    let (by_truth, known) = replayed(&library, "known", &folder.path().join("known"));
+    let (by_truth, known) = replayed(&library, "ground_truth", &folder.path().join("known"));
     let stamps = |poses: &[TimedPose]| -> Vec<_> { poses.iter().map(|p| p.stamp).collect() };
     assert_eq!(stamps(&by_model), stamps(&by_truth));
     assert!(by_model.len() > 20, "{}", by_model.len());
@@ -122,7 +123,7 @@ fn windows_within_a_batch_are_joined_as_one_window_would_be() {
         views.extend(model.infer(&batch(1, 3, &numbered[4..])).unwrap().views);
         views
     };
-    let poses = |views: &[View]| from_first(views.iter().map(|view| view.batch_from_cam));
+    let poses = |views: &[View]| from_first(views.iter().map(|view| view.submap_from_cam));
     let truth = from_first(frames.iter().map(|frame| frame.truth.unwrap()));
     for window in ["16", "3", "2"] {
         let views = views(window);
@@ -134,7 +135,7 @@ fn windows_within_a_batch_are_joined_as_one_window_would_be() {
             "{window}: {shift} {turn}"
         );
         for (view, frame) in views.iter().zip(&frames) {
-            let truth = frame.truth_depth.as_ref().unwrap();
+            let truth = frame.sensor_depth.as_ref().unwrap();
             assert_eq!(view.depth.depth.len(), truth.depth.len());
             for (at, exact) in truth.depth.iter().enumerate() {
                 if let Some((found, confidence)) = view.depth.verified(at) {

@@ -7,22 +7,24 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use splat_mapper::clock::Stopwatch;
-use splat_mapper::config::{PublishParams, Settings};
-use splat_mapper::export::ply;
-use splat_mapper::map::snapshot::Snapshot;
-use splat_mapper::publish::PublishError;
-use splat_mapper::publish::assemble::Assembler;
-use splat_mapper::publish::outbox::Outbox;
-use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::publish::wire::{KeyframeArray, SplatChunk, SplatManifest};
-use splat_mapper::publish::world;
-use splat_mapper::ros::{self, standard::Path};
 use zenoh::query::ConsolidationMode;
 use zenoh::sample::Sample;
 use zenoh::{Config, Session, Wait};
 
 use crate::formats::random_snapshot;
+use splat_mapper::node::save_map::{MapFile, save_map};
+use splat_mapper::params::settings::Settings;
+use splat_msgs::client::assembler::Assembler;
+use splat_msgs::map_messages::{KeyframeArray, SplatChunk, SplatManifest};
+use splat_msgs::ros;
+use splat_msgs::ros::standard::Path;
+use splat_msgs::type_hash::dds_type_name;
+use splat_ros::error::PublishError;
+use splat_ros::odometry;
+use splat_ros::params::PublishParams;
+use splat_ros::publisher::Publisher;
+use splat_types::snapshot::Snapshot;
+use splat_types::time::Stopwatch;
 
 pub const MAX_BYTES: usize = 64 << 20;
 
@@ -33,7 +35,7 @@ fn params(listen: &str) -> PublishParams {
     let mut params = Settings::shipped().params().unwrap().publish;
     params.scouting = false;
     params.zenoh = true;
-    params.full_secs = 0.0;
+    params.full_map_period = 0.0;
     params.zenoh_listen = listen.to_owned();
     params
 }
@@ -99,7 +101,7 @@ pub fn free_endpoint() -> String {
 
 #[test]
 fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
-    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
     let endpoints = publisher.endpoints();
     assert!(
         endpoints.len() == 1 && !endpoints[0].ends_with(":0"),
@@ -119,8 +121,8 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
         folder.path().join("sent.ply"),
         folder.path().join("received.ply"),
     ];
-    ply::write(&snapshot.splats, &paths[0]).unwrap();
-    ply::write(&received.splats, &paths[1]).unwrap();
+    save_map(MapFile::Ply(&snapshot.splats), &paths[0]).unwrap();
+    save_map(MapFile::Ply(&received.splats), &paths[1]).unwrap();
     assert!(std::fs::read(&paths[0]).unwrap() == std::fs::read(&paths[1]).unwrap());
 
     // The path alone, by its own key: in a robot's axes.
@@ -130,9 +132,12 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
         .map(|r| ros::decode(&r.into_result().unwrap().payload().to_bytes()).unwrap())
         .collect();
     assert_eq!((paths.len(), paths[0].poses.len()), (1, 7));
-    let last = world::ahead() * snapshot.poses[6].map_from_cam;
-    let told = paths[0].poses[6].pose.to_rigid().unwrap();
-    assert!((told.translation - last.translation).length() < 1e-9 && told.angle_to(&last) < 1e-9);
+    let last = odometry::forward_camera() * snapshot.poses[6].world_from_cam;
+    let reported = paths[0].poses[6].pose.to_rigid().unwrap();
+    assert!(
+        (reported.translation - last.translation).length() < 1e-9
+            && reported.angle_to(&last) < 1e-9
+    );
     publisher.close().unwrap();
 }
 
@@ -148,7 +153,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
     params.zenoh_connect = endpoint;
     params.namespace = "robot/mapper".to_owned();
     params.domain_id = 7;
-    let publisher = Outbox::open(&params).unwrap();
+    let publisher = Publisher::open(&params).unwrap();
     assert!(publisher.endpoints().is_empty());
     // Publishing begins when the peers know each other.
     let matching = session
@@ -198,7 +203,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
 
 #[test]
 fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
-    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
     let session = client("", &publisher.endpoints()[0]);
     let snapshot = Arc::new(random_snapshot(2000, 3, 1, 2));
     publisher.publish(&snapshot).unwrap();
@@ -261,7 +266,7 @@ impl Wire {
 
 #[test]
 fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
-    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
     let endpoint = publisher.endpoints().remove(0);
     // 18 MB each: more than all buffers on the way hold.
     let snapshot = |revision| Arc::new(random_snapshot(60_000, 3, 3, revision));
@@ -317,7 +322,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let mut params = params("");
     params.zenoh_connect = endpoint.clone();
     let started = Stopwatch::start();
-    let publisher = Outbox::open(&params).unwrap();
+    let publisher = Publisher::open(&params).unwrap();
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
     publisher.publish(&snapshot).unwrap();
     assert!(
@@ -331,7 +336,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
 
 #[test]
 fn close_without_peers_is_quick() {
-    let publisher = Outbox::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
     let started = Stopwatch::start();
     publisher.close().unwrap();
     assert!(started.secs() < 2.0, "{} s", started.secs());
@@ -348,7 +353,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     std::fs::write(&path, text).unwrap();
     let mut params = params("nonsense that nobody reads");
     params.zenoh_config = path.display().to_string();
-    let publisher = Outbox::open(&params).unwrap();
+    let publisher = Publisher::open(&params).unwrap();
     assert_eq!(publisher.endpoints(), std::slice::from_ref(&endpoint));
     let snapshot = Arc::new(random_snapshot(20, 1, 0, 1));
     publisher.publish(&snapshot).unwrap();
@@ -356,7 +361,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     publisher.close().unwrap();
 
     std::fs::write(&path, "{ listen: ").unwrap();
-    let fault = Outbox::open(&params).unwrap_err().to_string();
+    let fault = Publisher::open(&params).unwrap_err().to_string();
     assert!(
         fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"),
         "{fault}"
@@ -365,7 +370,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
 
 #[test]
 fn errors_name_the_parameter() {
-    let message = |params: PublishParams| Outbox::open(&params).unwrap_err().to_string();
+    let message = |params: PublishParams| Publisher::open(&params).unwrap_err().to_string();
     for bad in ["nonsense", "tcp/127.0.0.1", "warp/127.0.0.1:7447"] {
         let found = message(params(bad));
         assert!(found.contains("zenoh_listen"), "{bad}: {found}");
@@ -379,7 +384,7 @@ fn errors_name_the_parameter() {
     // A port that is taken.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("tcp/{}", listener.local_addr().unwrap());
-    let fault = Outbox::open(&params(&taken)).unwrap_err();
+    let fault = Publisher::open(&params(&taken)).unwrap_err();
     assert!(
         matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken),
         "{fault}"

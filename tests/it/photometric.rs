@@ -1,23 +1,24 @@
-//! Frames whose pose is a little wrong go back to where their pictures fit the splats.
+//! Frames whose pose is a little wrong go back to where their images fit the splats.
 
 use std::path::Path;
 
 use glam::DVec3;
-use splat_mapper::config::Settings;
-use splat_mapper::eval::trajectory::read_tum;
-use splat_mapper::frame::Frame;
-use splat_mapper::map::snapshot::Scale;
-use splat_mapper::map::{SplatMap, checkpoint};
-use splat_mapper::pose::Rigid;
-use splat_mapper::source::open;
-use splat_mapper::splat::cpu::CpuEngine;
 
 use crate::localise::run;
+use splat_engine::cpu::engine::CpuEngine;
+use splat_mapper::eval::trajectory::read_tum;
+use splat_mapper::node::open_source::open;
+use splat_mapper::params::settings::Settings;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_slam::mapper::mapper::Mapper;
+use splat_types::frame::Frame;
+use splat_types::snapshot::Scale;
+use splat_types::transform::Rigid;
 
 const ROOM: &str = "synthetic:room?frames=24&width=160&height=120";
 
 #[test]
-fn a_frame_goes_back_to_where_its_picture_fits() {
+fn a_frame_goes_back_to_where_its_image_fits() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().to_str().unwrap();
     let output = run(&[
@@ -26,11 +27,11 @@ fn a_frame_goes_back_to_where_its_picture_fits() {
         "--out",
         out,
         "--geometry",
-        "known",
+        "ground_truth",
         "--steps",
         "400",
         "--set",
-        "select.all=true",
+        "select.every_frame=true",
         "--backend",
         "cpu",
     ]);
@@ -39,8 +40,8 @@ fn a_frame_goes_back_to_where_its_picture_fits() {
     let params = Settings::shipped().params().unwrap();
     let saved = checkpoint::read(&folder.path().join("map.splatmap")).unwrap();
     let engine = Box::new(CpuEngine::new());
-    let map = SplatMap::new(params.map.clone(), 0, Scale::UP_TO_SCALE, engine);
-    let mut map = map.continued(saved, &params.track).unwrap();
+    let map = Mapper::new(params.mapper(), 0, Scale::UP_TO_SCALE, engine);
+    let mut map = map.resume_report(saved, &params.track).unwrap();
 
     let frames = frames();
     let poses = read_tum(Path::new(&folder.path().join("keyframes.tum"))).unwrap();
@@ -55,10 +56,11 @@ fn a_frame_goes_back_to_where_its_picture_fits() {
         );
         let wrong = pose.pose * off;
         let fit = map
-            .fit_frame(&frame.image, &frame.intrinsics.unwrap(), &wrong)
+            .refine_frame(&frame.image, &frame.intrinsics.unwrap(), &wrong)
+            .unwrap()
             .expect("a better pose");
         assert!(fit.losses[1] < fit.losses[0]);
-        for (sum, at) in [(&mut before, wrong), (&mut after, fit.map_from_cam)] {
+        for (sum, at) in [(&mut before, wrong), (&mut after, fit.world_from_cam)] {
             sum[0] += (at.translation - pose.pose.translation).length();
             sum[1] += at.angle_to(&pose.pose);
         }
@@ -66,13 +68,14 @@ fn a_frame_goes_back_to_where_its_picture_fits() {
     eprintln!("translation and turn off by {before:?}, then {after:?}");
     assert!(after[0] < 0.5 * before[0], "{before:?} {after:?}");
     assert!(after[1] < 0.5 * before[1], "{before:?} {after:?}");
-    // A picture of another place is no reason to move far.
+    // An image of another place is no reason to move far.
     assert!(
-        map.fit_frame(
+        map.refine_frame(
             &frames[0].image,
             &frames[0].intrinsics.unwrap(),
             &Rigid::exp(DVec3::new(0.0, 0.0, -500.0), DVec3::ZERO),
         )
+        .unwrap()
         .is_none(),
         "no splat is in view"
     );

@@ -1,12 +1,11 @@
 //! Snapshots over the wire: what a client puts together equals what was published.
 
-use splat_mapper::map::snapshot::Snapshot;
-use splat_mapper::publish::assemble::{Assembler, Counts};
-use splat_mapper::publish::type_hash::dds_type_name;
-use splat_mapper::publish::wire::{self, KeyframeArray, Messages, SplatChunk, SplatManifest};
-use splat_mapper::ros;
-
 use crate::formats::{Dice, random_snapshot};
+use splat_msgs::client::assembler::{Assembler, Counts};
+use splat_msgs::map_messages::{self, KeyframeArray, Messages, SplatChunk, SplatManifest};
+use splat_msgs::ros;
+use splat_msgs::type_hash::dds_type_name;
+use splat_types::snapshot::Snapshot;
 
 const MAX_BYTES: usize = 64 << 20;
 const FRAME: &str = "splat_map";
@@ -183,7 +182,7 @@ fn a_forged_chunk_with_a_fitting_crc_never_becomes_a_map() {
 }
 
 #[test]
-fn made_up_counts_and_endless_revisions_stay_within_the_byte_bound() {
+fn synthetic_counts_and_endless_revisions_stay_within_the_byte_bound() {
     let max_bytes = 1 << 20;
     let mut assembler = Assembler::new(max_bytes);
     let snapshot = random_snapshot(1000, 2, 1, 4);
@@ -227,15 +226,15 @@ fn payloads_of_noise_are_rejected_one_by_one() {
     let good = [
         (
             dds_type_name::<SplatChunk>(),
-            wire::payload(&messages.chunks().next().unwrap()).unwrap(),
+            map_messages::payload(&messages.chunks().next().unwrap()).unwrap(),
         ),
         (
             dds_type_name::<SplatManifest>(),
-            wire::payload(&messages.manifest()).unwrap(),
+            map_messages::payload(&messages.manifest()).unwrap(),
         ),
         (
             dds_type_name::<KeyframeArray>(),
-            wire::payload(&messages.keyframes().next().unwrap()).unwrap(),
+            map_messages::payload(&messages.keyframes().next().unwrap()).unwrap(),
         ),
     ];
     let mut n_sent = 0;
@@ -276,11 +275,14 @@ fn messages_keep_their_size_bounds() {
         }
         let largest = messages
             .keyframes()
-            .map(|array| wire::payload(&array).unwrap().len())
+            .map(|array| map_messages::payload(&array).unwrap().len())
             .max()
             .unwrap();
         assert!(
-            largest <= chunk_bytes.saturating_add(200).min(wire::MAX_MESSAGE_BYTES),
+            largest
+                <= chunk_bytes
+                    .saturating_add(200)
+                    .min(map_messages::MAX_MESSAGE_BYTES),
             "{largest} at {chunk_bytes}"
         );
     }
@@ -292,12 +294,12 @@ fn messages_survive_cdr() {
     let messages = Messages::new(&snapshot, FRAME, 4096);
     let chunk = messages.chunks().nth(1).unwrap();
     assert_eq!(
-        ros::decode::<SplatChunk>(&wire::payload(&chunk).unwrap()).unwrap(),
+        ros::decode::<SplatChunk>(&map_messages::payload(&chunk).unwrap()).unwrap(),
         chunk
     );
     let array = messages.keyframes().next().unwrap();
     assert_eq!(
-        ros::decode::<KeyframeArray>(&wire::payload(&array).unwrap()).unwrap(),
+        ros::decode::<KeyframeArray>(&map_messages::payload(&array).unwrap()).unwrap(),
         array
     );
     assert_eq!(array.header.frame_id, FRAME);

@@ -6,18 +6,23 @@ use std::sync::Arc;
 
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
-use splat_mapper::config::{RecordParams, Settings, SourceParams};
-use splat_mapper::frame::{Frame, RgbImage};
-use splat_mapper::select::Selector;
-use splat_mapper::source::camera::live::Live;
-use splat_mapper::source::camera::{Coding, Layout};
-use splat_mapper::source::pixels::PixelFormat;
-use splat_mapper::source::recording::{Input, Progress, RecordError, Wanted, record, record_from};
-use splat_mapper::source::{self, Source, camera_info};
 
 use crate::camera_script::{Clock, Script, Step, layout, steps_of};
 use crate::cameras::{params, room, source_of};
 use crate::sources::frames_of;
+use splat_image::pixel_format::PixelFormat;
+use splat_io::camera::driver::{Coding, Layout};
+use splat_io::camera::live::Live;
+use splat_io::camera_info;
+use splat_io::frame_source::Source;
+use splat_io::params::{RecordParams, SourceParams};
+use splat_io::recording::item::RecordError;
+use splat_io::recording::{Input, Progress, Wanted, record};
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_slam::select::selector::Selector;
+use splat_types::frame::Frame;
+use splat_types::image::RgbImage;
 
 const CALIBRATION: &str = "image_width: 192
 image_height: 144
@@ -39,21 +44,19 @@ fn recorded(script: &Script, url: &str, out: &Path, params: &RecordParams) -> Pr
     live.end_after(1.5);
     let input = Input::Camera(Box::new(live), info.map(|(info, _)| Box::new(info)));
     let wanted = Wanted {
-        source: "script".to_owned(),
         out: out.to_owned(),
         duration_secs: None,
-        seed: 0,
     };
-    record_from(input, &wanted, params, &asked, &mut |_| {}).unwrap()
+    record(input, &wanted, params, &asked, &mut |_| {}).unwrap()
 }
 
-fn jpeg_of(picture: &RgbImage) -> Vec<u8> {
+fn jpeg_of(image: &RgbImage) -> Vec<u8> {
     let mut bytes = Vec::new();
     JpegEncoder::new_with_quality(&mut bytes, 90)
         .encode(
-            &picture.pixels,
-            picture.width_px,
-            picture.height_px,
+            &image.pixels,
+            image.width_px,
+            image.height_px,
             ExtendedColorType::Rgb8,
         )
         .unwrap();
@@ -88,34 +91,34 @@ fn a_replay_of_a_recorded_camera_has_the_frames_and_keyframes_of_a_run_on_it() {
         max_frames: 12,
         ..params()
     };
-    let pictures = room(12);
+    let images = room(12);
     let raw = layout(PixelFormat::Rgb, (192, 144));
     let jpeg = Layout {
         coding: Coding::Mjpeg,
         ..raw
     };
     let jpegs = || {
-        let packed = |step: Step, picture: &RgbImage| match step {
-            Step::Picture {
+        let packed = |step: Step, image: &RgbImage| match step {
+            Step::Image {
                 sequence,
                 age_nanos,
                 is_damaged,
                 ..
-            } => Step::Picture {
+            } => Step::Image {
                 sequence,
                 age_nanos,
                 is_damaged,
-                bytes: Some(jpeg_of(picture)),
+                bytes: Some(jpeg_of(image)),
             },
             other => other,
         };
-        let steps = steps_of(&pictures, None).into_iter().zip(&pictures);
+        let steps = steps_of(&images, None).into_iter().zip(&images);
         steps
-            .map(|(step, picture)| packed(step, picture))
+            .map(|(step, image)| packed(step, image))
             .collect::<Vec<_>>()
     };
     for (name, layout, steps) in [
-        ("raw", raw, steps_of(&pictures, None)),
+        ("raw", raw, steps_of(&images, None)),
         ("jpeg", jpeg, jpegs()),
     ] {
         let script = || Script::new(layout, Clock::Nanos(0), steps.clone());
@@ -123,7 +126,7 @@ fn a_replay_of_a_recorded_camera_has_the_frames_and_keyframes_of_a_run_on_it() {
         let run: Vec<Frame> = std::iter::from_fn(|| live.next()).collect();
         let out = folder.path().join(format!("{name}.mcap"));
         let done = recorded(&script(), &url, &out, &record_params());
-        assert_eq!((done.n_pictures, done.n_dropped, done.n_files), (12, 0, 1));
+        assert_eq!((done.n_images, done.n_dropped, done.n_files), (12, 0, 1));
         let (replayed, counts) = frames_of(&out, &params());
         assert_eq!(counts.fault, None);
         same_frames(&replayed, &run);
@@ -138,15 +141,14 @@ fn a_replay_of_any_recorded_source_has_its_frames() {
     let out = folder.path().join("room.mcap");
     let uri = "synthetic:room?frames=6&width=96&height=72&lens=radial";
     let wanted = Wanted {
-        source: uri.to_owned(),
         out: out.clone(),
         duration_secs: None,
-        seed: 0,
     };
     let asked = Arc::default();
-    let done = record(&wanted, &params(), &record_params(), &asked, &mut |_| {}).unwrap();
-    assert_eq!((done.n_pictures, done.n_damaged), (6, 0));
-    let mut synthetic = source::open(uri, &params(), 0).unwrap();
+    let input = || open_source::open_input(uri, &params(), 0, None, &asked).unwrap();
+    let done = record(input(), &wanted, &record_params(), &asked, &mut |_| {}).unwrap();
+    assert_eq!((done.n_images, done.n_damaged), (6, 0));
+    let mut synthetic = open_source::open(uri, &params(), 0).unwrap();
     let expected: Vec<Frame> = std::iter::from_fn(|| synthetic.next()).collect();
     let (found, _) = frames_of(&out, &params());
     assert_eq!(found.len(), expected.len());
@@ -157,7 +159,7 @@ fn a_replay_of_any_recorded_source_has_its_frames() {
         assert!((found.cx - expected.cx).abs() < 1e-9 && found.fx == expected.fx);
     }
     // Another recording never takes its place.
-    let again = record(&wanted, &params(), &record_params(), &asked, &mut |_| {});
+    let again = record(input(), &wanted, &record_params(), &asked, &mut |_| {});
     assert!(
         matches!(again, Err(RecordError::Exists { .. })),
         "{again:?}"
@@ -168,8 +170,8 @@ fn a_replay_of_any_recorded_source_has_its_frames() {
 fn files_split_and_old_ones_go() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("drive.mcap");
-    let pictures = room(40);
-    let steps = steps_of(&pictures, None);
+    let images = room(40);
+    let steps = steps_of(&images, None);
     let script = Script::new(layout(PixelFormat::Rgb, (192, 144)), Clock::Nanos(0), steps);
     let limited = RecordParams {
         max_file_mib: 1,
@@ -178,7 +180,7 @@ fn files_split_and_old_ones_go() {
         ..record_params()
     };
     let done = recorded(&script, "", &out, &limited);
-    // 83 kB a picture: thirteen fill a file.
+    // 83 kB an image: thirteen fill a file.
     assert_eq!(done.n_files, 4);
     let mut names: Vec<String> = std::fs::read_dir(folder.path())
         .unwrap()
@@ -196,7 +198,7 @@ fn a_recording_that_is_cut_anywhere_loses_at_most_its_last_chunk() {
     let out = folder.path().join("drive.mcap");
     let steps = steps_of(&room(12), None);
     let script = Script::new(layout(PixelFormat::Rgb, (192, 144)), Clock::Nanos(0), steps);
-    // 83 kB a picture: a chunk of two.
+    // 83 kB an image: a chunk of two.
     let small = RecordParams {
         chunk_kib: 128,
         ..record_params()
@@ -207,7 +209,7 @@ fn a_recording_that_is_cut_anywhere_loses_at_most_its_last_chunk() {
     let mut last = 0;
     for length in (0..whole.len()).step_by(whole.len() / 97) {
         std::fs::write(&cut, &whole[..length]).unwrap();
-        let Ok(mut replay) = source::open(cut.to_str().unwrap(), &params(), 0) else {
+        let Ok(mut replay) = open_source::open(cut.to_str().unwrap(), &params(), 0) else {
             assert!(last == 0, "{length} of {} bytes", whole.len());
             continue;
         };
@@ -251,7 +253,7 @@ fn the_program_records_and_says_what_it_has() {
     );
     let n_frames = frames_of(&out, &params()).0.len();
     assert!(
-        text.starts_with(&format!("{n_frames} pictures in ")),
+        text.starts_with(&format!("{n_frames} images in ")),
         "{text}"
     );
     assert!(

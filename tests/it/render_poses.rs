@@ -1,78 +1,32 @@
 //! What `splat-mapper render` writes and what intrinsics it takes.
 
 use glam::{DQuat, DVec3};
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::Stamp;
-use splat_mapper::eval::render::{read_intrinsics, render_poses};
-use splat_mapper::pose::Rigid;
-use splat_mapper::splat::{
-    Engine, Match, McmcSettings, RefinerSettings, Rendering, Splats, StepSettings, StepStats,
-    TrainingView,
-};
 
+use crate::hooked::{Hooked, Hooks};
 use crate::scenes::scene;
+use splat_engine::cpu::engine::CpuEngine;
+use splat_mapper::eval::render::{read_intrinsics, render_poses};
+use splat_types::camera::Intrinsics;
+use splat_types::rendering::Rendering;
+use splat_types::splats::splats::Splats;
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
-/// Renders a ramp that depends on the pose, so that files can be told apart.
+/// Renders a ramp that depends on the pose, so that files can be determined apart.
 #[derive(Debug, Default)]
-struct Ramp {
-    n_splats: usize,
-}
+struct Ramp;
 
-impl Engine for Ramp {
-    fn adapter(&self) -> String {
-        "ramp".to_owned()
-    }
-    fn append(&mut self, splats: &Splats) {
-        self.n_splats += splats.len();
-    }
-    fn retain(&mut self, _: &[bool]) {}
-    fn overwrite(&mut self, _: &Splats) {}
-    fn n_splats(&self) -> usize {
-        self.n_splats
-    }
-    fn add_view(&mut self, _: TrainingView) -> usize {
-        0
-    }
-    fn set_pose(&mut self, _: usize, _: Rigid) {}
-    fn move_cameras(&mut self, _: &Rigid) {}
-    fn set_intrinsics(&mut self, _: usize, _: &Intrinsics) {}
-    fn set_image(
+impl Hooks for Ramp {
+    fn render(
         &mut self,
-        _: usize,
-        _: std::sync::Arc<splat_mapper::frame::RgbImage>,
-        _: &Intrinsics,
-    ) {
-    }
-    fn set_depth(&mut self, _: usize, _: Option<std::sync::Arc<splat_mapper::frame::DepthMap>>) {}
-    fn start_refiner(&mut self, _: &RefinerSettings) {}
-    fn set_mask(&mut self, _: usize, _: Option<std::sync::Arc<[u8]>>) {}
-    fn set_matches(&mut self, _: usize, _: &[Match]) {}
-    fn relocate_and_grow(&mut self, _: &McmcSettings) -> usize {
-        self.n_splats
-    }
-    fn focal_factor(&mut self) -> f64 {
-        1.0
-    }
-    fn exposures(&mut self) -> Vec<[[f32; 3]; 2]> {
-        Vec::new()
-    }
-    fn peak_gpu_bytes(&self) -> u64 {
-        0
-    }
-    fn step(&mut self, _: usize, _: &StepSettings) {}
-    fn take_stats(&mut self) -> StepStats {
-        StepStats::default()
-    }
-    fn poses(&mut self) -> Vec<Rigid> {
-        Vec::new()
-    }
-    fn splats(&mut self) -> Splats {
-        Splats::default()
-    }
-    fn render(&mut self, intrinsics: &Intrinsics, cam_from_map: &Rigid, _: u8) -> Rendering {
+        _: &mut CpuEngine,
+        intrinsics: &Intrinsics,
+        cam_from_world: &Rigid,
+        _: u8,
+    ) -> Rendering {
         let n = (intrinsics.width_px * intrinsics.height_px) as usize;
         // The camera stands at x = 1, 2, …, so the map's origin lies at -1, -2, … in its frame.
-        let step = -cam_from_map.translation.x as f32;
+        let step = -cam_from_world.translation.x as f32;
         Rendering {
             width_px: intrinsics.width_px,
             height_px: intrinsics.height_px,
@@ -106,12 +60,17 @@ fn renders_are_files_that_hold_the_rendering() {
     };
     let splats = Splats {
         means: vec![[0.0; 3]],
-        ..Splats::default()
+        log_scales: vec![[0.0; 3]],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]],
+        opacity_logits: vec![0.0],
+        sh: vec![0.0; 3],
+        sh_degree: 0,
+        anchors: vec![0],
     };
     let folder = out.path().join("new/folder");
     let n = render_poses(
         &splats,
-        &mut Ramp::default(),
+        &mut Hooked::<Ramp>::default(),
         &[pose(1.0), pose(3.0)],
         &intrinsics,
         &folder,
@@ -119,12 +78,12 @@ fn renders_are_files_that_hold_the_rendering() {
     )
     .unwrap();
     assert_eq!(n, 2);
-    let picture = image::open(folder.join("000001.png")).unwrap().into_rgb8();
-    assert_eq!(picture.dimensions(), (7, 5));
+    let image = image::open(folder.join("000001.png")).unwrap().into_rgb8();
+    assert_eq!(image.dimensions(), (7, 5));
     let expected: Vec<u8> = (0..105)
         .map(|ix| (ix * 3 - 2).clamp(0, 255) as u8)
         .collect();
-    assert_eq!(picture.into_raw(), expected);
+    assert_eq!(image.into_raw(), expected);
     let depth = image::open(folder.join("depth/000001.png")).unwrap();
     assert_eq!(depth.color(), image::ColorType::L16);
     assert_eq!(

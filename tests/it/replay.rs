@@ -1,13 +1,13 @@
-//! The whole program: runs of the binary over made-up and real recordings, good and bad.
+//! The whole program: runs of the binary over synthetic and real recordings, good and bad.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use serde_json::Value;
-use splat_mapper::eval::evaluation::compare;
-use splat_mapper::eval::trajectory::read_tum;
 
 use crate::scenes::scene;
+use splat_mapper::eval::evaluation::compare;
+use splat_mapper::eval::trajectory::read_tum;
 
 /// A small room, rendered in a second or two.
 const ROOM: &str = "synthetic:room?frames=24&width=192&height=144&speed=3";
@@ -46,7 +46,7 @@ fn a_replay_writes_a_whole_run_directory() {
     let output = replay(
         ROOM,
         folder.path(),
-        &["--geometry", "known", "--steps", "150"],
+        &["--geometry", "ground_truth", "--steps", "150"],
     );
     assert!(
         output.status.success(),
@@ -107,7 +107,7 @@ fn threads_and_sequence_give_the_same_map_and_a_seed_another() {
         let output = replay(
             ROOM,
             folder.path(),
-            &[&["--geometry", "known", "--steps", "80"], more].concat(),
+            &[&["--geometry", "ground_truth", "--steps", "80"], more].concat(),
         );
         assert!(output.status.success(), "{}", last_line(&output));
         report(folder.path())["map_sha256"]
@@ -121,7 +121,7 @@ fn threads_and_sequence_give_the_same_map_and_a_seed_another() {
 }
 
 #[test]
-fn structure_from_motion_finds_the_room_from_pictures_alone() {
+fn structure_from_motion_finds_the_room_from_images_alone() {
     let folder = tempfile::tempdir().unwrap();
     let wide = "synthetic:room?frames=16&width=480&height=360&speed=2";
     let output = replay(wide, folder.path(), &["--steps", "40"]);
@@ -130,7 +130,7 @@ fn structure_from_motion_finds_the_room_from_pictures_alone() {
     let truth = replay(
         wide,
         &folder.path().join("known"),
-        &["--geometry", "known", "--steps", "0"],
+        &["--geometry", "ground_truth", "--steps", "0"],
     );
     assert!(truth.status.success());
     let evaluation = compare(
@@ -178,7 +178,14 @@ fn a_recording_that_is_cut_off_is_used_up_to_the_fault() {
     let output = replay(
         cut.to_str().unwrap(),
         &out,
-        &["--geometry", "known", "--steps", "20", "--max-side", "160"],
+        &[
+            "--geometry",
+            "ground_truth",
+            "--steps",
+            "20",
+            "--max-side",
+            "160",
+        ],
     );
     assert!(output.status.success(), "{}", last_line(&output));
     let report = report(&out);
@@ -193,22 +200,22 @@ fn a_recording_that_is_cut_off_is_used_up_to_the_fault() {
 
 #[test]
 fn a_stage_that_fails_keeps_what_was_gathered_and_says_so() {
-    // Pictures without ground truth: known geometry cannot answer.
+    // Images without ground truth: known geometry cannot answer.
     let folder = tempfile::tempdir().unwrap();
-    let pictures = tempfile::tempdir().unwrap();
+    let images = tempfile::tempdir().unwrap();
     for name in ["1.png", "2.png"] {
-        let picture = image::RgbImage::new(64, 48);
-        picture.save(pictures.path().join(name)).unwrap();
+        let image = image::RgbImage::new(64, 48);
+        image.save(images.path().join(name)).unwrap();
     }
     let output = replay(
-        pictures.path().to_str().unwrap(),
+        images.path().to_str().unwrap(),
         folder.path(),
-        &["--geometry", "known"],
+        &["--geometry", "ground_truth"],
     );
     assert_eq!(output.status.code(), Some(1));
     let line = last_line(&output);
     assert!(
-        line.contains("known") && line.contains("--geometry sfm"),
+        line.contains("ground_truth") && line.contains("--geometry sfm"),
         "{line}"
     );
     assert!(report(folder.path())["error"].is_string());
@@ -232,12 +239,12 @@ fn bad_arguments_end_with_one_line_and_their_code() {
     check(
         &["replay", DEMO, "--set", "map.step=3"],
         2,
-        &["map.step", "map.steps"],
+        &["map.step", "train.steps"],
     );
     check(
-        &["replay", DEMO, "--set", "map.sh_degree=9"],
+        &["replay", DEMO, "--set", "train.sh_degree=9"],
         2,
-        &["map.sh_degree", "9", "[0, 3]"],
+        &["train.sh_degree", "9", "[0, 3]"],
     );
     check(&["replay", DEMO, "--rate", "fast"], 2, &["--rate", "fast"]);
     check(
@@ -276,7 +283,7 @@ fn a_full_disk_ends_with_exit_1_and_leaves_no_half_files() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
     let script = format!(
-        "trap '' XFSZ; ulimit -f 16; exec {} replay '{ROOM}' --geometry known --steps 10 --out {}",
+        "trap '' XFSZ; ulimit -f 16; exec {} replay '{ROOM}' --geometry ground_truth --steps 10 --out {}",
         env!("CARGO_BIN_EXE_splat-mapper"),
         out.display()
     );
@@ -297,7 +304,7 @@ fn eval_render_and_export_use_what_a_replay_wrote() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("run");
     assert!(
-        replay(ROOM, &out, &["--geometry", "known", "--steps", "40"])
+        replay(ROOM, &out, &["--geometry", "ground_truth", "--steps", "40"])
             .status
             .success()
     );

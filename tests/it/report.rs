@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 
 use serde_json::Value;
-use splat_mapper::config::Settings;
-use splat_mapper::eval::report::{
-    Continued, FrameCounts, KeyframeCounts, Latency, Quality, Report, Timing, TrackingFigures,
+
+use splat_mapper::eval::report_json::{
+    FrameCounts, KeyframeCounts, Latency, Quality, Report, Resumed, Timing, TrackingFigures,
 };
-use splat_mapper::map::figures::Budgets;
-use splat_mapper::map::snapshot;
+use splat_mapper::params::settings::Settings;
+use splat_slam::mapper::budgets::Budgets;
+use splat_types::snapshot;
 
 /// Scripts outside depend on these; a line may be added, none removed.
 const KEYS: &str = "\
@@ -29,6 +30,7 @@ continued.asked
 continued.found
 continued.joined
 continued.map_keyframes
+engine_faults
 error
 frames.dropped
 frames.out_of_order
@@ -46,7 +48,7 @@ latency_ms.keyframe_to_pose_p95
 latency_ms.keyframe_to_snapshot_p50
 latency_ms.keyframe_to_snapshot_p95
 map_sha256
-parameters.map.steps
+parameters.train.steps
 peak_gpu_mib
 peak_rss_mib
 quality.holdout_every
@@ -81,7 +83,7 @@ version";
 
 pub(crate) fn sample_report() -> Report {
     let mut settings = Settings::shipped();
-    settings.merge_setting("map.steps=1200").unwrap();
+    settings.merge_setting("train.steps=1200").unwrap();
     Report {
         version: "0.1.0".to_owned(),
         frames: FrameCounts {
@@ -94,7 +96,7 @@ pub(crate) fn sample_report() -> Report {
             selected: 38,
             registered: 37,
             before: 40,
-            components: 1,
+            submaps: 1,
         },
         splats: 58_312,
         steps: 1200,
@@ -129,7 +131,7 @@ pub(crate) fn sample_report() -> Report {
             evicted_splats: 12,
             ..Budgets::default()
         },
-        continued: Some(Continued {
+        resume_report: Some(Resumed {
             map_keyframes: 40,
             asked: 12,
             found: 9,
@@ -140,6 +142,7 @@ pub(crate) fn sample_report() -> Report {
         geometry_note: Some(
             "keyframe 21 shares too few features with its neighbours (motion blur)".to_owned(),
         ),
+        engine_faults: 1,
         error: None,
         parameters: settings
             .entries()
@@ -167,7 +170,7 @@ fn keys_of(prefix: &str, value: &Value, keys: &mut Vec<String>) {
 #[test]
 fn report_json_has_exactly_the_promised_keys() {
     let report = Report {
-        parameters: BTreeMap::from([("map.steps".to_owned(), Value::from(5))]),
+        parameters: BTreeMap::from([("train.steps".to_owned(), Value::from(5))]),
         ..sample_report()
     };
     let mut keys = Vec::new();

@@ -4,14 +4,15 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec3};
-use splat_mapper::camera::{Distortion, Lens};
-use splat_mapper::config::SourceParams;
-use splat_mapper::frame::Frame;
-use splat_mapper::pose::Rigid;
-use splat_mapper::source::scene_formats::{Layout, SceneView};
-use splat_mapper::source::{self, SourceCounts};
 
 use crate::sources::params;
+use splat_io::frame_source::SourceCounts;
+use splat_io::params::SourceParams;
+use splat_io::scene_formats::scene::{Layout, SceneView};
+use splat_mapper::node::open_source;
+use splat_types::camera::{CameraModel, Distortion};
+use splat_types::frame::Frame;
+use splat_types::transform::Rigid;
 
 /// Numbers travel as decimals or through two inversions.
 const TOLERANCE: f64 = 1e-9;
@@ -37,7 +38,7 @@ pub fn poses() -> Vec<(&'static str, Rigid)> {
     ]
 }
 
-pub fn picture(folder: &Path, name: &str, (width, height): (u32, u32)) {
+pub fn test_image(folder: &Path, name: &str, (width, height): (u32, u32)) {
     let path = folder.join(name);
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::RgbImage::from_pixel(width, height, image::Rgb([90, 120, 150]))
@@ -57,9 +58,9 @@ pub fn cameras_bin(camera: &Camera) -> Vec<u8> {
 
 pub fn images_bin(poses: &[(&str, Rigid)]) -> Vec<u8> {
     let mut bytes = (poses.len() as u64).to_le_bytes().to_vec();
-    for (ix, (name, world_from_cam)) in (0_i32..).zip(poses) {
+    for (ix, (name, gt_from_cam)) in (0_i32..).zip(poses) {
         bytes.extend(ix.to_le_bytes());
-        let pose = colmap_numbers(world_from_cam);
+        let pose = colmap_numbers(gt_from_cam);
         bytes.extend(pose.iter().flat_map(|v| v.to_le_bytes()));
         bytes.extend(7_i32.to_le_bytes());
         bytes.extend(name.as_bytes());
@@ -70,20 +71,20 @@ pub fn images_bin(poses: &[(&str, Rigid)]) -> Vec<u8> {
     bytes
 }
 
-fn colmap_numbers(world_from_cam: &Rigid) -> [f64; 7] {
-    let pose = world_from_cam.inverse();
+fn colmap_numbers(gt_from_cam: &Rigid) -> [f64; 7] {
+    let pose = gt_from_cam.inverse();
     let (q, t) = (pose.rotation, pose.translation);
     [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
 }
 
-/// A COLMAP scene with all its pictures.
+/// A COLMAP scene with all its images.
 pub fn colmap(root: &Path, camera: &Camera) {
     let model = root.join("sparse/0");
     std::fs::create_dir_all(&model).unwrap();
     std::fs::write(model.join("cameras.bin"), cameras_bin(camera)).unwrap();
     std::fs::write(model.join("images.bin"), images_bin(&poses())).unwrap();
     for (name, _) in poses() {
-        picture(&root.join("images"), name, SIZE);
+        test_image(&root.join("images"), name, SIZE);
     }
 }
 
@@ -100,15 +101,15 @@ fn colmap_text(root: &Path) {
     }
     std::fs::write(root.join("images.txt"), images).unwrap();
     for (name, _) in poses() {
-        picture(&root.join("images"), name, SIZE);
+        test_image(&root.join("images"), name, SIZE);
     }
 }
 
 /// One frame's matrix, with OpenGL axes.
-pub fn matrix(world_from_cam: &Rigid) -> String {
+pub fn matrix(gt_from_cam: &Rigid) -> String {
     let gl = DMat3::from_cols(DVec3::X, -DVec3::Y, -DVec3::Z);
-    let r = (world_from_cam.rotation_matrix() * gl).to_cols_array_2d();
-    let t = world_from_cam.translation;
+    let r = (gt_from_cam.rotation_matrix() * gl).to_cols_array_2d();
+    let t = gt_from_cam.translation;
     let row = |i: usize, t: f64| format!("[{}, {}, {}, {t}]", r[0][i], r[1][i], r[2][i]);
     format!(
         "[{}, {}, {}, [0, 0, 0, 1]]",
@@ -132,7 +133,7 @@ pub fn transforms(keys: &str, name_of: impl Fn(&str) -> String) -> String {
 
 fn frames_of(path: &Path, params: &SourceParams) -> (Vec<Frame>, SourceCounts) {
     let uri = format!("images:{}", path.display());
-    let mut source = source::open(&uri, params, 0).unwrap();
+    let mut source = open_source::open(&uri, params, 0).unwrap();
     let frames = std::iter::from_fn(|| source.next()).collect();
     (frames, source.counts())
 }
@@ -165,7 +166,7 @@ fn views_of(path: &Path) -> Vec<SceneView> {
     Layout::find(path).unwrap().views(640).unwrap()
 }
 
-fn lens_of(camera: &Camera) -> Result<Lens, String> {
+fn lens_of(camera: &Camera) -> Result<CameraModel, String> {
     let root = tempfile::tempdir().unwrap();
     colmap(root.path(), camera);
     let views = Layout::find(root.path()).unwrap().views(640);
@@ -183,7 +184,7 @@ fn binary_and_text_models_and_transforms_give_the_same_frames() {
     let camera = r#""fl_x": 50, "fl_y": 51, "cx": 31, "cy": 25, "w": 64, "h": 48.0"#;
     let ngp = root.path().join("ngp");
     for (name, _) in poses() {
-        picture(&ngp.join("images"), name, SIZE);
+        test_image(&ngp.join("images"), name, SIZE);
     }
     std::fs::write(
         ngp.join("transforms.json"),
@@ -249,8 +250,8 @@ fn the_smallest_folder_that_is_large_enough_is_read_and_intrinsics_follow() {
     for (name, _) in poses() {
         // The smaller copies have another extension, as some tools leave them.
         let name = name.replace("png", "JPG");
-        picture(&root.path().join("images_2"), &name, (32, 24));
-        picture(&root.path().join("images_4"), &name, (16, 12));
+        test_image(&root.path().join("images_2"), &name, (32, 24));
+        test_image(&root.path().join("images_4"), &name, (16, 12));
     }
     let check = |max_side: u32, folder: &str, width: u32| {
         let params = SourceParams {
@@ -259,7 +260,7 @@ fn the_smallest_folder_that_is_large_enough_is_read_and_intrinsics_follow() {
         };
         let views = Layout::find(root.path()).unwrap().views(max_side).unwrap();
         assert!(
-            views[0].picture.starts_with(root.path().join(folder)),
+            views[0].image.starts_with(root.path().join(folder)),
             "{:?}",
             views[0]
         );
@@ -274,7 +275,7 @@ fn the_smallest_folder_that_is_large_enough_is_read_and_intrinsics_follow() {
 }
 
 #[test]
-fn missing_pictures_are_counted_and_keep_their_place() {
+fn missing_images_are_counted_and_keep_their_place() {
     let root = tempfile::tempdir().unwrap();
     colmap(root.path(), &pinhole());
     std::fs::remove_file(root.path().join("images/f2.png")).unwrap();
@@ -286,8 +287,11 @@ fn missing_pictures_are_counted_and_keep_their_place() {
         std::fs::remove_file(root.path().join("images").join(name)).unwrap();
     }
     let uri = format!("images:{}", root.path().display());
-    let error = source::open(&uri, &params(), 0).err().unwrap().to_string();
-    assert!(error.contains("none of its 3 pictures"), "{error}");
+    let error = open_source::open(&uri, &params(), 0)
+        .err()
+        .unwrap()
+        .to_string();
+    assert!(error.contains("none of its 3 images"), "{error}");
 }
 
 #[test]
@@ -295,8 +299,8 @@ fn names_choose_the_views_and_those_held_out() {
     let root = tempfile::tempdir().unwrap();
     colmap(root.path(), &pinhole());
     let params = SourceParams {
-        names: "f1".to_owned(),
-        held_out_names: "f10".to_owned(),
+        include_prefixes: "f1".to_owned(),
+        holdout_prefixes: "f10".to_owned(),
         ..params()
     };
     let (frames, _) = frames_of(root.path(), &params);
@@ -305,7 +309,7 @@ fn names_choose_the_views_and_those_held_out() {
         .map(|f| (f.stamp.nanos, f.is_held_out))
         .collect();
     let two = SourceParams {
-        pick: 2,
+        subsample: 2,
         ..crate::sources::params()
     };
     let stamps = |(frames, _): (Vec<Frame>, SourceCounts)| -> Vec<i64> {
@@ -326,14 +330,14 @@ fn names_choose_the_views_and_those_held_out() {
 }
 
 #[test]
-fn blender_scenes_hold_out_their_test_views_and_take_the_size_from_a_picture() {
+fn blender_scenes_hold_out_their_test_views_and_take_the_size_from_a_image() {
     let root = tempfile::tempdir().unwrap();
     for (file, folder) in [
         ("transforms_train.json", "train"),
         ("transforms_test.json", "test"),
     ] {
         for (name, _) in poses() {
-            picture(&root.path().join(folder), name, SIZE);
+            test_image(&root.path().join(folder), name, SIZE);
         }
         let name_of = |name: &str| format!("./{folder}/{}", name.trim_end_matches(".png"));
         let text = transforms(r#""camera_angle_x": 1.2"#, name_of);
@@ -352,7 +356,7 @@ fn blender_scenes_hold_out_their_test_views_and_take_the_size_from_a_picture() {
 fn nerfstudio_keys_give_lens_depth_and_the_world_before_its_turn() {
     let root = tempfile::tempdir().unwrap();
     for (name, _) in poses() {
-        picture(&root.path().join("images"), name, SIZE);
+        test_image(&root.path().join("images"), name, SIZE);
     }
     image::ImageBuffer::from_pixel(8, 6, image::Luma([1500_u16]))
         .save(root.path().join("depth.png"))
@@ -366,7 +370,7 @@ fn nerfstudio_keys_give_lens_depth_and_the_world_before_its_turn() {
     );
     std::fs::write(root.path().join("transforms.json"), text).unwrap();
     let views = views_of(root.path());
-    let lenses: Vec<Lens> = views.iter().map(|v| v.lens.unwrap()).collect();
+    let lenses: Vec<CameraModel> = views.iter().map(|v| v.lens.unwrap()).collect();
     assert_eq!(
         lenses[2].intrinsics.fx, 55.0,
         "a frame's own key goes first"
@@ -378,9 +382,9 @@ fn nerfstudio_keys_give_lens_depth_and_the_world_before_its_turn() {
     );
     let t = poses()[1].1.translation - DVec3::new(5.0, 0.0, 0.0);
     let undone = DVec3::new(t.x, -t.z, t.y);
-    assert!(views[0].world_from_cam.translation.distance(undone) < TOLERANCE);
+    assert!(views[0].gt_from_cam.translation.distance(undone) < TOLERANCE);
     let (frames, _) = frames_of(root.path(), &params());
-    let depth = frames[2].truth_depth.as_ref().unwrap();
+    let depth = frames[2].sensor_depth.as_ref().unwrap();
     assert!(depth.depth.iter().all(|d| (d - 1.5).abs() < 1e-6));
-    assert!(frames[0].truth_depth.is_none());
+    assert!(frames[0].sensor_depth.is_none());
 }

@@ -1,10 +1,9 @@
 //! A scene of another program as the reference of `eval`: the stamps are those that its replay gives the frames.
 
+use crate::scene_formats::{colmap, pinhole};
+use splat_io::scene_formats::scene::Layout;
 use splat_mapper::eval::evaluation::evaluate;
 use splat_mapper::eval::trajectory::{TimedPose, write_tum};
-use splat_mapper::source::scene_formats::Layout;
-
-use crate::scene_formats::{colmap, pinhole};
 
 #[test]
 fn eval_takes_a_scene_as_reference() {
@@ -17,7 +16,7 @@ fn eval_takes_a_scene_as_reference() {
         .into_iter()
         .map(|view| TimedPose {
             stamp: view.stamp,
-            pose: view.world_from_cam,
+            pose: view.gt_from_cam,
         });
     let timed: Vec<TimedPose> = timed.collect();
     write_tum(&timed, &root.path().join("keyframes.tum")).unwrap();

@@ -4,14 +4,17 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::{Params, Settings};
-use splat_mapper::frame::{Batch, Frame, Keyframe, RgbImage};
-use splat_mapper::geometry::sfm::{NO_PARALLAX, Sfm, SparseBatch};
-use splat_mapper::pose::Rigid;
 
 use crate::scenes::scene;
+use splat_geometry::sfm::estimator::Sfm;
+use splat_geometry::sfm::updates::{NO_PARALLAX, SparseBatch};
+use splat_mapper::params::params::Params;
+use splat_mapper::params::settings::Settings;
+use splat_types::camera::Intrinsics;
+use splat_types::frame::{Batch, Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::Rigid;
 
 pub(crate) struct Shown {
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
@@ -51,7 +54,7 @@ impl Shown {
     }
 }
 
-/// Every `stride`-th picture of a scene's folder, at most `max_side` pixels long, with its reference pose.
+/// Every `stride`-th image of a scene's folder, at most `max_side` pixels long, with its reference pose.
 pub(crate) fn shown(folder: &Path, max_side: u32, stride: usize, calibrated: bool) -> Shown {
     let list = std::fs::read_to_string(folder.join("images.txt")).unwrap();
     let rows = list
@@ -102,7 +105,7 @@ pub(crate) fn keyframe(
         intrinsics: calibrated.then(|| lens.resized(w, h)),
         truth: None,
         odometry: None,
-        truth_depth: None,
+        sensor_depth: None,
         is_held_out: false,
     };
     Arc::new(Keyframe {
@@ -150,10 +153,10 @@ pub(crate) fn reference(path: &Path) -> Vec<(f64, Rigid)> {
 #[derive(Debug)]
 pub(crate) struct Figures {
     pub(crate) registered: usize,
-    pub(crate) components: usize,
+    pub(crate) submaps: usize,
     pub(crate) ate_percent: f64,
     pub(crate) rotation_deg: f64,
-    /// Of the last placed keyframe, in its picture.
+    /// Of the last registered keyframe, in its image.
     pub(crate) focal_px: f64,
     pub(crate) note: Option<String>,
 }
@@ -175,11 +178,11 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let mut focal_px = f64::NAN;
     let mut take = |out: &SparseBatch| {
         for view in &out.views {
-            poses.insert(view.keyframe_id, (view.component, view.batch_from_cam));
+            poses.insert(view.keyframe_id, (view.submap, view.submap_from_cam));
             focal_px = view.intrinsics.fx;
         }
         for new in &out.revised {
-            poses.insert(new.keyframe_id, (new.component, new.batch_from_cam));
+            poses.insert(new.keyframe_id, (new.submap, new.submap_from_cam));
             focal_px = new.intrinsics.fx;
         }
     };
@@ -197,8 +200,8 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     }
     let last = sfm.finish_sparse();
     take(&last);
-    let components: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
-    let largest = components
+    let submaps: std::collections::BTreeSet<u32> = poses.values().map(|p| p.0).collect();
+    let largest = submaps
         .iter()
         .max_by_key(|c| poses.values().filter(|p| p.0 == **c).count());
     let pairs: Vec<(Rigid, Rigid)> = poses
@@ -209,7 +212,7 @@ pub(crate) fn run(shown: &Shown, changes: &[&str]) -> Figures {
     let (ate_percent, rotation_deg) = errors(&pairs);
     Figures {
         registered: pairs.len(),
-        components: components.len(),
+        submaps: submaps.len(),
         ate_percent,
         rotation_deg,
         focal_px,
@@ -270,7 +273,7 @@ fn fox_is_registered_whole_in_one_frame() {
     let figures = run(&shown(&folder, 480, 1, true), &["sfm.max_side=480"]);
     eprintln!("fox: {figures:?}");
     assert!(
-        figures.registered >= 48 && figures.components == 1,
+        figures.registered >= 48 && figures.submaps == 1,
         "{figures:?}"
     );
     assert!(
@@ -287,7 +290,7 @@ fn fox_is_registered_whole_by_corners() {
     eprintln!("fox by ORB: {figures:?}");
     // Measured: 0.107 % and 0.111 deg.
     assert!(
-        figures.registered >= 48 && figures.components == 1,
+        figures.registered >= 48 && figures.submaps == 1,
         "{figures:?}"
     );
     assert!(

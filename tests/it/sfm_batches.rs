@@ -1,16 +1,16 @@
-//! Uncalibrated and unordered pictures: small batches on their own, the whole set without its order.
+//! Uncalibrated and unordered images: small batches on their own, the whole set without its order.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 
-use crate::hard_pictures::{hall, stroll};
+use crate::hard_images::{hall, stroll};
 use crate::hard_world::{Flaws, LENS, Paint, film};
 use crate::scenes::scene;
 use crate::sfm::{Shown, intrinsics, run, shown};
 
 const BATCH: usize = 6;
 
-/// Share registered over all windows of `BATCH` pictures, and the worst focal length as a ratio to the true one.
+/// Share registered over all windows of `BATCH` images, and the worst focal length as a ratio to the true one.
 fn windows(name: &str, shown: &Shown, focal_px: f64, changes: &[&str]) -> (f64, f64) {
     let (mut registered, mut all) = (0, 0);
     let mut worst = 0.0_f64;
@@ -31,7 +31,7 @@ fn windows(name: &str, shown: &Shown, focal_px: f64, changes: &[&str]) -> (f64, 
 }
 
 #[test]
-fn six_pictures_of_the_fox_are_enough_for_poses_and_focal_length() {
+fn six_images_of_the_fox_are_enough_for_poses_and_focal_length() {
     let Some(folder) = scene("fox") else { return };
     let shown = shown(&folder, 640, 1, false);
     let width = f64::from(shown.keyframes[0].frame.image.width_px);
@@ -45,7 +45,7 @@ fn six_pictures_of_the_fox_are_enough_for_poses_and_focal_length() {
 }
 
 #[test]
-fn six_pictures_of_a_hall_are_enough_for_poses_and_focal_length() {
+fn six_images_of_a_hall_are_enough_for_poses_and_focal_length() {
     let shown = film(&hall(Paint::Varied), &stroll(), Flaws::default(), LENS);
     let changes = ["sfm.max_side=400", "sfm.max_features=1000"];
     let (share, worst) = windows("hall", &shown, LENS.fx, &changes);
@@ -70,7 +70,7 @@ fn a_fox_without_order_and_calibration_is_registered_whole() {
         figures.focal_px / focal
     );
     assert_eq!(
-        (figures.registered, figures.components),
+        (figures.registered, figures.submaps),
         (50, 1),
         "{figures:?}"
     );

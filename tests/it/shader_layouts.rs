@@ -3,10 +3,13 @@
 use std::mem::{offset_of, size_of};
 
 use naga::{Module, ScalarKind, TypeInner};
-use splat_mapper::gpu::kernel::{ALL, Kernel, PROJECT};
-use splat_mapper::gpu::types::{self, Camera, Dip, Moves, Projected, SortPass, Step, Sweep, Warp};
 
-use crate::shaders::{LANES, module};
+use crate::shaders::{LANES, kernels, module};
+use splat_engine::wgpu::kernels::PROJECT;
+use splat_engine::wgpu::types::{self, Camera, Moves, Projected, Step};
+use splat_geometry::mvs::gpu_types::{self, Dip, Sweep, Warp};
+use splat_gpu::kernel::Kernel;
+use splat_gpu::types::{SCAN_BLOCK, SORT_BLOCK, SortPass};
 
 /// (name, offset, WGSL type) of each field, and the size.
 type Layout = (Vec<(String, usize, String)>, usize);
@@ -96,7 +99,7 @@ fn the_step_has_the_layout_of_the_host() {
         lr_sh_rest,
         lr_rotation,
         lr_translation,
-        lr_refiner,
+        lr_pose_network,
         lr_focal,
         lr_exposure,
         noise,
@@ -176,7 +179,7 @@ fn other_shared_structs_have_the_layout_of_the_host() {
         n_steps,
         sh_stored,
         min_opacity,
-        by_picture,
+        by_image,
         padding_0,
         padding_1
     );
@@ -208,8 +211,8 @@ fn structs_of_a_sweep_have_the_layout_of_the_host() {
 }
 
 fn kernel(name: &str) -> Kernel {
-    let found = ALL.iter().find(|kernel| kernel.name == name).unwrap();
-    Kernel { ..**found }
+    let found = kernels().find(|kernel| kernel.name == name).unwrap();
+    Kernel { ..*found }
 }
 
 #[test]
@@ -226,18 +229,18 @@ fn shared_numbers_are_those_of_the_host() {
         };
         assert_eq!(u64::from(*found), expected, "{constant}");
     };
-    check("sort_count", "SORT_BLOCK", u64::from(types::SORT_BLOCK));
-    check("scan_sums", "SCAN_BLOCK", u64::from(types::SCAN_BLOCK));
+    check("sort_count", "SORT_BLOCK", u64::from(SORT_BLOCK));
+    check("scan_sums", "SCAN_BLOCK", u64::from(SCAN_BLOCK));
     check("project", "TILE_PX", u64::from(types::TILE_PX));
     check(
         "mvs_paths",
         "MAX_SWEEP_PLANES",
-        u64::from(types::MAX_SWEEP_PLANES),
+        u64::from(gpu_types::MAX_SWEEP_PLANES),
     );
     for (constant, expected) in [
-        ("SWEEP_WINDOW", types::SWEEP_WINDOW),
-        ("SWEEP_TILE_X", types::SWEEP_TILE_X),
-        ("SWEEP_TILE_Y", types::SWEEP_TILE_Y),
+        ("SWEEP_WINDOW", gpu_types::SWEEP_WINDOW),
+        ("SWEEP_TILE_X", gpu_types::SWEEP_TILE_X),
+        ("SWEEP_TILE_Y", gpu_types::SWEEP_TILE_Y),
     ] {
         check("mvs_cost", constant, u64::from(expected));
     }
@@ -270,7 +273,7 @@ fn shared_numbers_are_those_of_the_host() {
         ("FLAG_POSE_DIRECT", types::FLAG_POSE_DIRECT),
         ("FLAG_POSE_SHARED", types::FLAG_POSE_SHARED),
         ("FLAG_DEPTH", types::FLAG_DEPTH),
-        ("FLAG_REFINER", types::FLAG_REFINER),
+        ("FLAG_REFINER", types::FLAG_POSE_NETWORK),
     ] {
         check("update_view", constant, u64::from(expected));
     }

@@ -3,10 +3,14 @@
 
 use std::collections::BTreeSet;
 
-use naga::valid::{Capabilities, ValidationFlags, Validator};
-use naga::valid::{ShaderStages, SubgroupOperationSet};
+use naga::valid::{Capabilities, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
 use naga::{AddressSpace, Module, StorageAccess};
-use splat_mapper::gpu::kernel::{self, ALL, Access, Kernel, LIB, Lanes, PROJECT};
+
+use splat_engine::wgpu::kernels as splats;
+use splat_engine::wgpu::kernels::{PROJECT, RASTER_BACKWARD_ATOMIC};
+use splat_geometry::mvs::kernels as sweep;
+use splat_gpu::kernel as shared;
+use splat_gpu::kernel::{Access, Kernel, Lanes};
 
 /// Without and with subgroups, as adapters have them.
 pub const LANES: [Lanes; 4] = [
@@ -30,6 +34,11 @@ pub const LANES: [Lanes; 4] = [
 /// What WebGPU guarantees to every stage, and to a uniform.
 const MAX_STORAGE_BINDINGS: usize = 8;
 
+/// The tables of all that have shaders.
+pub fn kernels() -> impl Iterator<Item = &'static Kernel> {
+    [shared::ALL, splats::ALL, sweep::ALL].concat().into_iter()
+}
+
 pub fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
     let text = kernel
         .text(lanes)
@@ -37,7 +46,7 @@ pub fn module(kernel: &Kernel, lanes: Lanes) -> Result<Module, String> {
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| e.emit_to_string(&text))?;
     let mut capabilities = Capabilities::SUBGROUP;
     // The one that engines compile only where the adapter has float atomics.
-    let is_atomic = kernel.name == kernel::RASTER_BACKWARD_ATOMIC.name;
+    let is_atomic = kernel.name == RASTER_BACKWARD_ATOMIC.name;
     capabilities.set(Capabilities::SHADER_FLOAT32_ATOMIC, is_atomic);
     let mut validator = Validator::new(ValidationFlags::all(), capabilities);
     if lanes.are_subgroup {
@@ -110,7 +119,7 @@ fn faults(kernel: &Kernel, lanes: Lanes) -> Result<(), String> {
 #[test]
 fn every_shader_is_valid_and_as_the_table_says() {
     for lanes in LANES {
-        for kernel in ALL {
+        for kernel in kernels() {
             faults(kernel, lanes)
                 .unwrap_or_else(|e| panic!("shaders/{}.wgsl, {lanes:?}: {e}", kernel.name));
         }
@@ -118,7 +127,7 @@ fn every_shader_is_valid_and_as_the_table_says() {
 }
 
 #[test]
-fn the_table_lists_every_file() {
+fn the_tables_list_every_file_once() {
     let files = |folder: &str| -> BTreeSet<String> {
         let entries = std::fs::read_dir(folder)
             .unwrap()
@@ -128,13 +137,16 @@ fn the_table_lists_every_file() {
             .map(|p| p.file_stem().unwrap().to_str().unwrap().to_owned())
             .collect()
     };
-    assert_eq!(
-        files("shaders"),
-        ALL.iter().map(|k| k.name.to_owned()).collect()
-    );
+    let names: BTreeSet<String> = kernels().map(|k| k.name.to_owned()).collect();
+    assert_eq!(files("shaders"), names);
+    assert_eq!(kernels().count(), names.len(), "a shader is in two tables");
+    let libraries = [shared::LIBRARIES, splats::LIBRARIES, sweep::LIBRARIES].concat();
     assert_eq!(
         files("shaders/lib"),
-        LIB.iter().map(|(name, _)| (*name).to_owned()).collect()
+        libraries
+            .iter()
+            .map(|(name, _)| (*name).to_owned())
+            .collect()
     );
 }
 

@@ -1,18 +1,21 @@
-//! Recordings and folders of pictures -> frames: colours, stamps, calibration, truth.
+//! Recordings and folders of images -> frames: colours, stamps, calibration, truth.
 
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use mcap::Compression;
-use splat_mapper::camera::Intrinsics;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::{Settings, SourceParams};
-use splat_mapper::frame::{Frame, RgbImage};
-use splat_mapper::source::mcap::McapSource;
-use splat_mapper::source::{self, Source, SourceCounts};
 
 use crate::bags::{self, BagForm, BagWriter, Endian, tenth};
 use crate::scenes::scene;
+use splat_io::frame_source::{Source, SourceCounts};
+use splat_io::mcap::McapSource;
+use splat_io::params::SourceParams;
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_types::camera::Intrinsics;
+use splat_types::frame::Frame;
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
 
 pub const TOPIC: &str = "/camera/image_raw";
 
@@ -29,7 +32,7 @@ pub fn saved(bytes: &[u8]) -> (tempfile::TempDir, PathBuf) {
 }
 
 pub fn frames_of(path: &Path, params: &SourceParams) -> (Vec<Frame>, SourceCounts) {
-    let mut source = source::open(path.to_str().unwrap(), params, 0).unwrap();
+    let mut source = open_source::open(path.to_str().unwrap(), params, 0).unwrap();
     let frames: Vec<Frame> = std::iter::from_fn(|| source.next()).collect();
     (frames, source.counts())
 }
@@ -219,7 +222,7 @@ fn a_paced_replay_takes_as_long_as_the_recording() {
 }
 
 #[test]
-fn a_plain_folder_of_pictures_is_read_in_natural_order() {
+fn a_plain_folder_of_images_is_read_in_natural_order() {
     let folder = tempfile::tempdir().unwrap();
     for n in [2_u8, 10, 1] {
         let rgb = vec![n; 4 * 3 * 3];
@@ -265,16 +268,16 @@ fn the_fox_recording_gives_fifty_frames_with_truth() {
             && (i.cy - (482.134 + 0.5) * scale).abs() < 1e-6,
         "{i:?}"
     );
-    // The bag and the folder of pictures hold the same frames; only their stamps differ.
-    let (pictures, _) = frames_of(&folder, &params());
-    assert_eq!(pictures.len(), 50);
-    assert_eq!(pictures[7].image, frames[7].image);
-    let gap = pictures[7].truth.unwrap().translation - frames[7].truth.unwrap().translation;
+    // The bag and the folder of images hold the same frames; only their stamps differ.
+    let (images, _) = frames_of(&folder, &params());
+    assert_eq!(images.len(), 50);
+    assert_eq!(images[7].image, frames[7].image);
+    let gap = images[7].truth.unwrap().translation - frames[7].truth.unwrap().translation;
     assert!(gap.length() < 1e-6);
 }
 
 #[test]
-fn the_resting_drone_gives_twenty_frames_from_its_folder() {
+fn the_still_drone_gives_twenty_frames_from_its_folder() {
     let Some(folder) = scene("static_euroc") else {
         return;
     };
@@ -305,7 +308,7 @@ fn every_second_frame_of_the_kitchen_has_truth() {
     let Some(folder) = scene("kitchen7s") else {
         return;
     };
-    // Its images.txt lists pictures that are only in the recording.
+    // Its images.txt lists images that are only in the recording.
     let (frames, counts) = frames_of(
         &folder,
         &SourceParams {

@@ -1,14 +1,14 @@
-//! Made-up scenes: pictures, poses and depth agree, and are rich enough to map.
+//! Synthetic scenes: images, poses and depth agree, and are rich enough to map.
 
 use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3};
-use kornia_image::{Image, ImageSize};
-use kornia_imgproc::features::FastDetector;
-use splat_mapper::camera::{Distortion, Lens};
-use splat_mapper::frame::{DepthMap, RgbImage};
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::source::synthetic::{SceneKind, SynthSettings};
+
+use splat_synth::settings::{SceneKind, SynthSettings};
+use splat_synth::take::Take;
+use splat_types::camera::{CameraModel, Distortion};
+use splat_types::depth::DepthMap;
+use splat_types::image::RgbImage;
 
 const SCENES: [SceneKind; 3] = [SceneKind::Room, SceneKind::Facade, SceneKind::Corridor];
 
@@ -56,7 +56,7 @@ fn spread(values: impl Iterator<Item = f64>) -> f64 {
 /// Gives the share of points seen in both, and the median difference of their colours in levels.
 fn carry_over(take: &Take, from: u32, to: u32, pose_of_to: u32) -> (f64, f64) {
     let camera = take.settings().lens().intrinsics;
-    let (picture, other) = (take.picture(from), take.picture(to));
+    let (image, other) = (take.image(from), take.image(to));
     let (depth, other_depth) = (take.depth(from, &camera), take.depth(to, &camera));
     let to_from_from = take.pose(pose_of_to).inverse() * take.pose(from);
     let (mut inside, mut differences) = (0, Vec::new());
@@ -74,7 +74,7 @@ fn carry_over(take: &Take, from: u32, to: u32, pose_of_to: u32) -> (f64, f64) {
             inside += 1;
             // One pixel of a slanted wall spans a few centimetres of depth.
             if (nearest(&other_depth, there) - point.z).abs() < 0.02 * point.z {
-                let here = colour(&picture, pixel).unwrap();
+                let here = colour(&image, pixel).unwrap();
                 differences.push((here - colour_there).abs().max_element());
             }
         }
@@ -103,7 +103,7 @@ fn depth_and_poses_carry_one_frame_onto_another() {
 }
 
 /// Where the ROS models put a point of the plane z = 1, written out once more from their definitions.
-fn shown(lens: &Lens, at: DVec2) -> DVec2 {
+fn shown(lens: &CameraModel, at: DVec2) -> DVec2 {
     let distorted = match lens.distortion {
         Distortion::PlumbBob([k1, k2, p1, p2, k3]) => {
             let (x, y, r2) = (at.x, at.y, at.length_squared());
@@ -115,12 +115,12 @@ fn shown(lens: &Lens, at: DVec2) -> DVec2 {
         }
         Distortion::Equidistant([k1, k2, k3, k4]) => {
             let angle = at.length().atan();
-            let bent = angle
+            let distorted_image = angle
                 + k1 * angle.powi(3)
                 + k2 * angle.powi(5)
                 + k3 * angle.powi(7)
                 + k4 * angle.powi(9);
-            at * bent / at.length()
+            at * distorted_image / at.length()
         }
         _ => at,
     };
@@ -131,27 +131,24 @@ fn shown(lens: &Lens, at: DVec2) -> DVec2 {
 #[test]
 fn every_lens_shows_the_same_world() {
     let straight = take("room?width=320&height=240");
-    let picture = straight.picture(7);
+    let image = straight.image(7);
     let camera = straight.settings().lens().intrinsics;
     for options in [
         "room?width=480&height=360&lens=radial",
         "room?width=640&height=480&lens=fisheye",
     ] {
-        let bent = take(options);
-        let lens = bent.settings().lens();
-        let bent_picture = bent.picture(7);
+        let distorted = take(options);
+        let lens = distorted.settings().lens();
+        let distorted_image = distorted.image(7);
         let compare = |shift: f64| {
             let mut differences = Vec::new();
             for y in (2..238).step_by(3) {
                 for x in (2..318).step_by(3) {
                     let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
                     let place = shown(&lens, camera.ray_in_cam(pixel).truncate()) + shift;
-                    if let Some(there) = colour(&bent_picture, place) {
-                        differences.push(
-                            (colour(&picture, pixel).unwrap() - there)
-                                .abs()
-                                .max_element(),
-                        );
+                    if let Some(there) = colour(&distorted_image, place) {
+                        differences
+                            .push((colour(&image, pixel).unwrap() - there).abs().max_element());
                     }
                 }
             }
@@ -175,9 +172,9 @@ fn every_lens_shows_the_same_world() {
 fn a_seed_repeats_everything_and_another_one_changes_noise_and_hand() {
     let options = "corridor?width=96&height=64&noise=4&blur=0.3&exposure=0.3";
     let [first, again, other] = [7, 7, 8].map(|seed| take(&format!("{options}&seed={seed}")));
-    assert_eq!(first.picture(3), again.picture(3));
+    assert_eq!(first.image(3), again.image(3));
     assert_eq!(first.pose(3), again.pose(3));
-    assert_ne!(first.picture(3), other.picture(3));
+    assert_ne!(first.image(3), other.image(3));
     let apart = first
         .pose(3)
         .translation
@@ -185,26 +182,68 @@ fn a_seed_repeats_everything_and_another_one_changes_noise_and_hand() {
     assert!(apart > 1e-4 && apart < 0.2, "{apart}");
 }
 
+/// FAST-9 (Rosten and Drummond 2006): pixels with nine neighbours in a row on a circle that are all brighter, or all
+/// darker, and no such pixel of a larger margin beside them.
+fn fast_corners(grey: &[i16], width: usize) -> Vec<(usize, usize)> {
+    /// The usual threshold of ORB.
+    const THRESHOLD: i16 = 20;
+    const CIRCLE: [(isize, isize); 16] = [
+        (0, -3),
+        (1, -3),
+        (2, -2),
+        (3, -1),
+        (3, 0),
+        (3, 1),
+        (2, 2),
+        (1, 3),
+        (0, 3),
+        (-1, 3),
+        (-2, 2),
+        (-3, 1),
+        (-3, 0),
+        (-3, -1),
+        (-2, -2),
+        (-1, -3),
+    ];
+    let height = grey.len() / width;
+    let offsets = CIRCLE.map(|(x, y)| y * width as isize + x);
+    // The largest threshold at which the pixel is still a corner.
+    let margin = |p: usize| {
+        let steps = offsets.map(|offset| grey[p.strict_add_signed(offset)] - grey[p]);
+        let arc = |sign: i16, first: usize| (0..9).map(|k| sign * steps[(first + k) % 16]).min();
+        let arcs = (0..16).flat_map(|first| [arc(1, first), arc(-1, first)]);
+        arcs.flatten().max().unwrap()
+    };
+    let mut margins = vec![0; grey.len()];
+    for y in 3..height - 3 {
+        let inside = y * width + 3..(y + 1) * width - 3;
+        for (p, slot) in inside.clone().zip(&mut margins[inside]) {
+            *slot = margin(p);
+        }
+    }
+    let is_corner = |p: &usize| {
+        let beside = [1, width - 1, width, width + 1];
+        let is_largest = |d: usize| margins[*p] > margins[p - d] && margins[*p] >= margins[p + d];
+        margins[*p] > THRESHOLD && beside.into_iter().all(is_largest)
+    };
+    (0..grey.len())
+        .filter(is_corner)
+        .map(|p| (p % width, p / width))
+        .collect()
+}
+
 #[test]
 fn a_feature_detector_finds_many_corners_all_over_every_frame() {
     for scene in SCENES {
         let take = Take::new(SynthSettings::of(scene)).unwrap();
         for ix in [0, 40, 80] {
-            let picture = take.picture(ix);
-            let grey = picture.pixels.chunks(3).map(|p| {
-                ((77 * u32::from(p[0]) + 150 * u32::from(p[1]) + 29 * u32::from(p[2])) >> 8) as u8
+            let image = take.image(ix);
+            let grey = image.pixels.chunks(3).map(|p| {
+                ((77 * i32::from(p[0]) + 150 * i32::from(p[1]) + 29 * i32::from(p[2])) >> 8) as i16
             });
-            let size = ImageSize {
-                width: 640,
-                height: 480,
-            };
-            let image = Image::<u8, 1>::new(size, grey.collect()).unwrap();
-            // 20 of 255 levels is the usual threshold of ORB.
-            let mut detector = FastDetector::new(size, 20.0 / 255.0, 9, 4).unwrap();
-            let candidates = detector.detect_direct_u8(&image, 16);
-            let corners = detector.suppress_direct(candidates, usize::MAX);
+            let corners = fast_corners(&grey.collect::<Vec<_>>(), 640);
             let mut cells = BTreeMap::new();
-            for ([y, x], _) in &corners {
+            for (x, y) in &corners {
                 *cells.entry((y / 60, x / 80)).or_insert(0) += 1;
             }
             let full = cells.values().filter(|n| **n >= 5).count();
@@ -250,10 +289,7 @@ fn the_camera_moves_smoothly_and_comes_back() {
             "{scene:?}"
         );
         let up = take.pose(0).rotation * DVec3::NEG_Y;
-        assert!(
-            up.z > 0.9,
-            "{scene:?}: the top of the picture points to {up}"
-        );
+        assert!(up.z > 0.9, "{scene:?}: the top of the image points to {up}");
     }
 }
 
@@ -261,8 +297,8 @@ fn the_camera_moves_smoothly_and_comes_back() {
 fn noise_has_the_spread_that_was_asked_for() {
     let size = "room?width=160&height=120";
     let (clean, noisy) = (
-        take(size).picture(2),
-        take(&format!("{size}&noise=5")).picture(2),
+        take(size).image(2),
+        take(&format!("{size}&noise=5")).image(2),
     );
     // Only mid tones: black and white clip one side of the noise.
     let pairs = clean
@@ -281,10 +317,10 @@ fn exposure_drifts_by_the_stops_that_were_asked_for() {
     let mean = |image: &RgbImage| {
         image.pixels.iter().map(|v| f64::from(*v)).sum::<f64>() / image.pixels.len() as f64
     };
-    let fixed = mean(&fixed.picture(0));
+    let fixed = mean(&fixed.image(0));
     let over_time: Vec<f64> = (0..83)
         .step_by(4)
-        .map(|ix| mean(&drifting.picture(ix)))
+        .map(|ix| mean(&drifting.image(ix)))
         .collect();
     let (low, high) = over_time
         .iter()
@@ -298,8 +334,8 @@ fn exposure_drifts_by_the_stops_that_were_asked_for() {
 #[test]
 fn blur_softens_what_moves_and_nothing_else() {
     let detail = |options: &str| {
-        let picture = take(&format!("room?width=160&height=120{options}")).picture(31);
-        picture
+        let image = take(&format!("room?width=160&height=120{options}")).image(31);
+        image
             .pixels
             .chunks(3 * 160)
             .flat_map(|row| row.windows(4))

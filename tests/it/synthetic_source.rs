@@ -1,17 +1,19 @@
-//! The source of made-up frames, its options, and the recordings written of them.
+//! The source of synthetic frames, its options, and the recordings written of them.
 
 use std::collections::BTreeMap;
 
 use glam::DVec2;
-use splat_mapper::config::{Settings, SourceParams};
-use splat_mapper::frame::RgbImage;
-use splat_mapper::ros::{self, CameraInfo, CompressedImage, PoseStamped, TfMessage};
-use splat_mapper::source::Source;
-use splat_mapper::source::synthetic::record::{truth_tum, write_recording};
-use splat_mapper::source::synthetic::take::Take;
-use splat_mapper::source::synthetic::{LensKind, SynthSettings, SyntheticSource};
 
 use crate::synthetic::{colour, median};
+use splat_io::frame_source::Source;
+use splat_io::params::SourceParams;
+use splat_mapper::params::settings::Settings;
+use splat_msgs::ros::{self, CameraInfo, CompressedImage, PoseStamped, TfMessage};
+use splat_synth::record::{truth_tum, write_recording};
+use splat_synth::settings::{LensKind, SynthSettings};
+use splat_synth::source::SyntheticSource;
+use splat_synth::take::Take;
+use splat_types::image::RgbImage;
 
 fn source_params() -> SourceParams {
     Settings::shipped().params().unwrap().source
@@ -47,7 +49,7 @@ fn the_source_hands_out_frames_with_truth() {
         (160, 120, 160)
     );
     assert!(intrinsics.is_plausible());
-    let depth = frame.truth_depth.as_ref().unwrap();
+    let depth = frame.sensor_depth.as_ref().unwrap();
     assert_eq!(
         (depth.width_px, depth.height_px, depth.confidence.len()),
         (80, 60, 4800)
@@ -76,10 +78,10 @@ fn the_source_straightens_lenses_when_asked() {
     .unwrap();
     let raw = raw.next().unwrap();
     assert!(
-        raw.intrinsics.is_none() && raw.truth_depth.is_none(),
-        "a bent picture fits no pinhole"
+        raw.intrinsics.is_none() && raw.sensor_depth.is_none(),
+        "a distorted image fits no pinhole"
     );
-    let straightened = SyntheticSource::open("room?lens=radial", &params, 0)
+    let undistorted = SyntheticSource::open("room?lens=radial", &params, 0)
         .unwrap()
         .next()
         .unwrap();
@@ -88,7 +90,7 @@ fn the_source_straightens_lenses_when_asked() {
         .next()
         .unwrap();
     let (from, to) = (
-        straightened.intrinsics.unwrap(),
+        undistorted.intrinsics.unwrap(),
         straight.intrinsics.unwrap(),
     );
     // Both look from the same place, so a pixel of one is a pixel of the other.
@@ -108,10 +110,10 @@ fn the_source_straightens_lenses_when_asked() {
         assert!(differences.len() > 5000);
         median(differences)
     };
-    let (after, before) = (difference(&straightened.image), difference(&raw.image));
+    let (after, before) = (difference(&undistorted.image), difference(&raw.image));
     assert!(
         after < 8.0 && after < 0.4 * before,
-        "{after} straightened, {before} raw"
+        "{after} undistorted, {before} raw"
     );
 }
 
@@ -234,9 +236,9 @@ fn check_messages<'a>(settings: &SynthSettings, payload: impl Fn(usize, usize) -
         ),
         (32, 24, 64, "16UC1")
     );
-    let picture: CompressedImage = ros::decode(payload(2, 4)).unwrap();
-    let decoded = image::load_from_memory(&picture.data).unwrap().to_rgb8();
-    let filmed = take.picture(4);
+    let image: CompressedImage = ros::decode(payload(2, 4)).unwrap();
+    let decoded = image::load_from_memory(&image.data).unwrap().to_rgb8();
+    let filmed = take.image(4);
     let error = decoded
         .as_raw()
         .iter()
@@ -266,7 +268,7 @@ fn check_messages<'a>(settings: &SynthSettings, payload: impl Fn(usize, usize) -
         ),
         ("camera_optical", "camera_optical")
     );
-    assert_eq!(pose.header.stamp, picture.header.stamp);
+    assert_eq!(pose.header.stamp, image.header.stamp);
 }
 
 #[test]

@@ -1,15 +1,15 @@
 //! Which topics a recording is read from, and how depth and ground truth find their frames.
 
 use glam::DVec3;
-use splat_mapper::clock::Stamp;
-use splat_mapper::config::SourceParams;
-use splat_mapper::ros::{Header, Image, Pose, TfMessage, TransformStamped};
 
 use crate::bags::{self, BagForm, BagWriter, tenth};
 use crate::sources::{TOPIC, frames_of, params, pixel, replay, saved};
+use splat_io::params::SourceParams;
+use splat_msgs::ros::{Header, Image, Pose, TfMessage, TransformStamped};
+use splat_types::time::Stamp;
 
 #[test]
-fn a_named_topic_wins_and_depth_topics_are_no_pictures() {
+fn a_named_topic_wins_and_depth_topics_are_no_images() {
     let mut bag = BagWriter::new(BagForm::default());
     for n in 0..4 {
         let stamp = tenth(n);
@@ -49,7 +49,7 @@ fn a_named_topic_wins_and_depth_topics_are_no_pictures() {
     );
     let (frames, _) = frames_of(&path, &params());
     for (n, frame) in frames.iter().enumerate() {
-        let depth = frame.truth_depth.as_ref().unwrap();
+        let depth = frame.sensor_depth.as_ref().unwrap();
         assert!(
             (depth.depth[5] - (n as f32 + 1.0) - 0.005).abs() < 1e-5,
             "frame {n}: {:?}",
@@ -59,7 +59,7 @@ fn a_named_topic_wins_and_depth_topics_are_no_pictures() {
 }
 
 #[test]
-fn depth_that_comes_later_than_its_picture_still_finds_it() {
+fn depth_that_comes_later_than_its_image_still_finds_it() {
     let mut bag = BagWriter::new(BagForm::default());
     for n in 0..8 {
         bag.add(
@@ -81,7 +81,7 @@ fn depth_that_comes_later_than_its_picture_still_finds_it() {
     let (frames, _) = replay(bag, &params());
     let first: Vec<_> = frames
         .iter()
-        .map(|f| f.truth_depth.as_ref().map(|d| d.depth[0]))
+        .map(|f| f.sensor_depth.as_ref().map(|d| d.depth[0]))
         .collect();
     let expected = [
         Some(3.0),
@@ -94,7 +94,7 @@ fn depth_that_comes_later_than_its_picture_still_finds_it() {
         None,
     ];
     assert_eq!(first, expected);
-    let depth = frames[0].truth_depth.as_ref().unwrap();
+    let depth = frames[0].sensor_depth.as_ref().unwrap();
     assert_eq!(
         (&depth.depth[1..4], &depth.confidence[..5]),
         (&[0.0; 3][..], &[1.0, 0.0, 0.0, 0.0, 1.0][..])
@@ -136,7 +136,7 @@ fn tf_gives_the_truth_when_no_pose_topic_does() {
                 frame_id: parent.to_owned(),
             },
             child_frame_id: child.to_owned(),
-            transform: Pose::from(splat_mapper::pose::Rigid::new(turn, at)),
+            transform: Pose::from(splat_types::transform::Rigid::new(turn, at)),
         }],
     };
     // base looks along its x; the optical frame has z there, x to the right, y down (REP-103).
@@ -173,8 +173,8 @@ fn tf_gives_the_truth_when_no_pose_topic_does() {
     }
     let (frames, _) = replay(bag, &params());
     for (n, frame) in frames.iter().enumerate() {
-        let world_from_cam = frame.truth.unwrap();
-        let ahead = world_from_cam.transform_point(DVec3::Z);
+        let gt_from_cam = frame.truth.unwrap();
+        let ahead = gt_from_cam.transform_point(DVec3::Z);
         // The base is turned left, so what is ahead of the camera lies along the world's y.
         let expected = DVec3::new(n as f64, 1.2, 0.1);
         assert!((ahead - expected).length() < 1e-9, "frame {n}: {ahead}");

@@ -1,4 +1,4 @@
-//! The tracker over made-up scenes whose poses and depth are known exactly.
+//! The tracker over synthetic scenes whose poses and depth are known exactly.
 
 use std::sync::{Arc, OnceLock};
 
@@ -6,13 +6,18 @@ use glam::{DQuat, DVec3};
 use nalgebra::{Matrix6, Vector6};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
-use splat_mapper::clock::{Stamp, Stopwatch};
-use splat_mapper::config::Settings;
-use splat_mapper::config::track::TrackParams;
-use splat_mapper::frame::{DepthMap, Frame, Keyframe, RgbImage};
-use splat_mapper::pose::Rigid;
-use splat_mapper::source;
-use splat_mapper::track::{KeyframeView, State, TrackedFrame, Tracker};
+
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_slam::track::landmarks::KeyframeView;
+use splat_slam::track::params::TrackParams;
+use splat_slam::track::tracker::Tracker;
+use splat_types::depth::DepthMap;
+use splat_types::frame::{Frame, Keyframe};
+use splat_types::image::RgbImage;
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::tracking::{TrackState, TrackedFrame};
+use splat_types::transform::Rigid;
 
 /// 10 Hz, at most 2 deg from frame to frame.
 const ROOM: &str = "synthetic:room?frames=60&width=320&height=240&speed=0.5";
@@ -28,7 +33,7 @@ fn params() -> TrackParams {
 
 fn frames_of(uri: &str) -> Vec<Frame> {
     let params = Settings::shipped().params().unwrap();
-    let mut source = source::open(uri, &params.source, 0).unwrap();
+    let mut source = open_source::open(uri, &params.source, 0).unwrap();
     std::iter::from_fn(|| source.next()).collect()
 }
 
@@ -44,10 +49,10 @@ fn view(id: usize, frame: &Frame) -> KeyframeView {
             frame: frame.clone(),
             age: Stopwatch::start(),
         }),
-        map_from_cam: frame.truth.unwrap(),
+        world_from_cam: frame.truth.unwrap(),
         intrinsics: frame.intrinsics.unwrap(),
         lens: None,
-        depth: Arc::clone(frame.truth_depth.as_ref().unwrap()),
+        depth: Arc::clone(frame.sensor_depth.as_ref().unwrap()),
         covariance: None,
     }
 }
@@ -58,12 +63,12 @@ fn views(frames: &[Frame]) -> Vec<KeyframeView> {
 }
 
 fn median_depth(frame: &Frame) -> f64 {
-    f64::from(frame.truth_depth.as_ref().unwrap().median().unwrap())
+    f64::from(frame.sensor_depth.as_ref().unwrap().median().unwrap())
 }
 
 /// (shift as a share of the depth, degrees).
 fn error(tracked: &TrackedFrame, frame: &Frame) -> (f64, f64) {
-    let (pose, truth) = (tracked.pose.unwrap().map_from_cam, frame.truth.unwrap());
+    let (pose, truth) = (tracked.pose.unwrap().world_from_cam, frame.truth.unwrap());
     let shift = (pose.translation - truth.translation).length();
     (
         shift / median_depth(frame),
@@ -76,7 +81,7 @@ fn is_right(tracked: &TrackedFrame, frame: &Frame) -> bool {
     tracked.is_measured() && shift < MAX_SHIFT && turn < MAX_TURN_DEG
 }
 
-/// The same picture at another time.
+/// The same image at another time.
 fn at(frame: &Frame, seq: u64, secs: f64) -> Frame {
     Frame {
         seq,
@@ -112,10 +117,18 @@ fn every_frame_is_tracked_by_keyframes_that_come_late() {
         }
         let tracked = tracker.track(frame);
         if i >= 2 * KEYFRAME_EVERY {
-            assert_eq!(tracked.state, State::Tracking, "{i}: {:?}", tracked.reason);
+            assert_eq!(
+                tracked.state,
+                TrackState::Tracking,
+                "{i}: {:?}",
+                tracked.reason
+            );
             right += usize::from(is_right(&tracked, frame));
         } else {
-            assert_eq!((tracked.state, tracked.pose), (State::Initialising, None));
+            assert_eq!(
+                (tracked.state, tracked.pose),
+                (TrackState::Initialising, None)
+            );
         }
     }
     assert!(right >= 50, "{right} of 52");
@@ -129,7 +142,7 @@ fn frames_from_before_the_map_get_their_pose_on_a_second_look() {
         assert!(tracker.track(frame).pose.is_none());
     }
     tracker.update(&views(frames));
-    assert_eq!(tracker.look_again(5), 5);
+    assert_eq!(tracker.retry(5), 5);
     let tracks = tracker.finish(|| true);
     assert_eq!((tracks.n_frames, tracks.n_tracked), (17, 0));
     for (track, frame) in tracks.frames.iter().zip(frames) {
@@ -157,19 +170,19 @@ fn a_blackout_is_declared_and_over_as_soon_as_there_is_light() {
         assert!(std > last_std, "{i}: {std} after {last_std}");
         last_std = std;
         if i >= 4 {
-            assert_eq!(tracked.state, State::Lost, "0.5 s have passed");
+            assert_eq!(tracked.state, TrackState::Lost, "0.5 s have passed");
         }
     }
     // The camera has gone on in the dark.
     let back = tracker.track(&at(&frames[34], 50, 5.0));
-    assert_eq!(back.state, State::Relocalised, "{:?}", back.reason);
+    assert_eq!(back.state, TrackState::Relocalised, "{:?}", back.reason);
     assert!(
         is_right(&back, &frames[34]),
         "{:?}",
         error(&back, &frames[34])
     );
     let next = tracker.track(&at(&frames[35], 51, 5.1));
-    assert_eq!(next.state, State::Tracking);
+    assert_eq!(next.state, TrackState::Tracking);
     let tracks = tracker.finish(|| true);
     assert_eq!((tracks.n_lost, tracks.n_relocalised), (1, 1));
 }
@@ -195,12 +208,12 @@ fn a_kidnapped_camera_is_noticed_and_never_said_to_be_where_it_is_not() {
                 tracked.n_inliers
             );
         }
-        if matches!(tracked.state, State::Lost | State::Relocalised) {
+        if matches!(tracked.state, TrackState::Lost | TrackState::Relocalised) {
             declared = declared.or(Some(i));
         }
     }
     assert!(declared.is_some_and(|i| i <= 4), "{declared:?}");
-    assert_eq!(tracker.state(), State::Tracking);
+    assert_eq!(tracker.state(), TrackState::Tracking);
 }
 
 #[test]
@@ -211,7 +224,7 @@ fn a_place_that_no_keyframe_shows_gives_no_pose() {
         let tracked = tracker.track(&frame);
         assert!(!tracked.is_measured(), "{} inliers", tracked.n_inliers);
     }
-    assert_eq!(tracker.state(), State::Initialising);
+    assert_eq!(tracker.state(), TrackState::Initialising);
 }
 
 #[test]
@@ -231,16 +244,16 @@ fn the_pose_follows_keyframes_that_the_map_moves_and_rescales() {
         )
     };
     for view in &mut all {
-        view.map_from_cam = moved(view.map_from_cam);
+        view.world_from_cam = moved(view.world_from_cam);
         let mut depth = (*view.depth).clone();
         depth.depth.iter_mut().for_each(|z| *z *= 1.5);
         view.depth = Arc::new(depth);
     }
     tracker.update(&all);
     let tracked = tracker.track(&frames[9]);
-    assert_eq!(tracked.state, State::Tracking, "{:?}", tracked.reason);
+    assert_eq!(tracked.state, TrackState::Tracking, "{:?}", tracked.reason);
     let wanted = moved(frames[9].truth.unwrap());
-    let found = tracked.pose.unwrap().map_from_cam;
+    let found = tracked.pose.unwrap().world_from_cam;
     assert!(
         (found.translation - wanted.translation).length() < 0.03 && found.angle_to(&wanted) < 0.01
     );
@@ -285,7 +298,7 @@ fn noisy_depth(depth: &DepthMap, rng: &mut Pcg32) -> DepthMap {
 /// e^T C^-1 e of the camera in its own axes.
 fn nees(tracked: &TrackedFrame, frame: &Frame) -> f64 {
     let pose = tracked.pose.unwrap();
-    let off = pose.map_from_cam.inverse() * frame.truth.unwrap();
+    let off = pose.world_from_cam.inverse() * frame.truth.unwrap();
     let short = if off.rotation.w < 0.0 {
         -off.rotation
     } else {
@@ -348,7 +361,7 @@ fn stated_covariances_cover_the_errors() {
 }
 
 #[test]
-fn frames_that_are_no_pictures_of_the_camera_are_refused_with_a_reason() {
+fn frames_that_are_no_images_of_the_camera_are_refused_with_a_reason() {
     let frames = room();
     let mut tracker = Tracker::new(&params());
     assert_eq!(
@@ -373,7 +386,7 @@ fn frames_that_are_no_pictures_of_the_camera_are_refused_with_a_reason() {
     );
     unknown.image = Arc::new(unknown.image.shrunk(200));
     let reason = tracker.track(&unknown).reason.unwrap().to_string();
-    assert_eq!(reason, "no calibration for pictures of 200x150 is known");
+    assert_eq!(reason, "no calibration for images of 200x150 is known");
     // Stamps that stand still or jump back are no reason to fall over.
     assert!(is_right(
         &tracker.track(&at(&frames[4], 4, 0.3)),

@@ -4,13 +4,14 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use serde_json::Value;
+
 use splat_mapper::eval::trajectory::read_tum;
 
-/// Small batches, so that the map tells of its keyframes several times.
+/// Small batches, so that the map indicates its keyframes several times.
 const ROOM: &str = "synthetic:room?frames=30&width=192&height=144&speed=1.5";
 const SETTINGS: [&str; 10] = [
     "--geometry",
-    "known",
+    "ground_truth",
     "--steps",
     "30",
     "--holdout",

@@ -5,11 +5,12 @@ use std::path::Path;
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_mapper::clock::Stamp;
+
 use splat_mapper::eval::trajectory::{
     TOLERANCE_SECS, TimedPose, associate, format_tum, parse_tum, shifted, stamp_offset_nanos,
 };
-use splat_mapper::pose::Rigid;
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
 
 #[test]
 fn poses_are_paired_by_time_once_each() {

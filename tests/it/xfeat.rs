@@ -3,16 +3,17 @@
 use std::path::{Path, PathBuf};
 
 use glam::DVec2;
-use splat_mapper::config::Settings;
-use splat_mapper::geometry::features::xfeat::{Raw, Xfeat, points};
-use splat_mapper::geometry::features::{Descriptors, Features, Finder, working_picture};
-use splat_mapper::geometry::matching::{Comparable, matches};
-use splat_mapper::geometry::scale_space::Grey;
 
 use crate::graphs::library;
 use crate::lpips::{network, saved};
 use crate::scenes::scene;
 use crate::sfm::{run, shown};
+use splat_geometry::features::descriptor::{Descriptors, Features, working_image};
+use splat_geometry::features::extractor::FeatureExtractor;
+use splat_geometry::features::scale_space::Grey;
+use splat_geometry::features::xfeat::{Raw, Xfeat, points};
+use splat_geometry::matching::{PreparedDescriptors, matches};
+use splat_mapper::params::settings::Settings;
 
 const WIDTH: usize = 640;
 const HEIGHT: usize = 480;
@@ -34,11 +35,11 @@ fn model() -> Option<(PathBuf, PathBuf)> {
     Some((library, model))
 }
 
-/// Two pictures of the fox, seen from nearly the same place.
-fn pictures() -> Vec<Grey> {
+/// Two images of the fox, seen from nearly the same place.
+fn images() -> Vec<Grey> {
     let all = shown(&scene("fox").unwrap(), 640, 2, true);
     let some = all.keyframes[..2].iter();
-    some.map(|k| working_picture(&k.frame.image, 640)).collect()
+    some.map(|k| working_image(&k.frame.image, 640)).collect()
 }
 
 /// (pixel, score, unit descriptor), the surest first.
@@ -142,7 +143,7 @@ fn points_and_matches_are_those_of_a_plain_computation() {
         return;
     };
     let network = Xfeat::open_by(&library, &model).unwrap();
-    let raws: Vec<Raw> = pictures().iter().map(|p| network.raw(p).unwrap()).collect();
+    let raws: Vec<Raw> = images().iter().map(|p| network.raw(p).unwrap()).collect();
     for raw in &raws {
         let sizes = [raw.feats.len(), raw.keypoints.len(), raw.heatmap.len()];
         assert_eq!(sizes, [64 * CELLS.2, 65 * CELLS.2, CELLS.2]);
@@ -163,7 +164,7 @@ fn points_and_matches_are_those_of_a_plain_computation() {
             }
         }
     }
-    let of = |features: &Features| Comparable::new(&features.descriptors);
+    let of = |features: &Features| PreparedDescriptors::new(&features.descriptors);
     let found = matches(&of(&own[0]), &of(&own[1]));
     let expected = reference_matches(&plain[0], &plain[1]);
     let n_common = found.iter().filter(|pair| expected.contains(pair)).count();
@@ -209,12 +210,12 @@ fn the_network_says_what_it_said_to_others() {
         let short = (0.07 * x).sin() * (0.05 * y).cos();
         (0.5 + 0.25 * short + 0.2 * (0.013 * (x + 2.0 * y)).sin()) as f32
     };
-    let picture = Grey {
+    let image = Grey {
         width: WIDTH,
         height: HEIGHT,
         pixels: (0..WIDTH * HEIGHT).map(wave).collect(),
     };
-    let raw = network.raw(&picture).unwrap();
+    let raw = network.raw(&image).unwrap();
     for (found, (some, size)) in [raw.feats, raw.keypoints, raw.heatmap]
         .iter()
         .zip(REFERENCE)
@@ -231,24 +232,19 @@ fn the_network_says_what_it_said_to_others() {
 }
 
 #[test]
-fn pictures_of_any_size_keep_their_places_and_blank_ones_are_survived() {
+fn images_of_any_size_keep_their_places_and_blank_ones_are_survived() {
     let Some((library, model)) = model() else {
         return;
     };
     let network = Xfeat::open_by(&library, &model).unwrap();
-    let picture = &pictures()[0];
-    let found = network.features(picture, 500);
+    let image = &images()[0];
+    let found = network.features(image, 500);
     let inside = |p: &DVec2| {
-        p.cmpge(DVec2::ZERO).all() && p.x < picture.width as f64 && p.y < picture.height as f64
+        p.cmpge(DVec2::ZERO).all() && p.x < image.width as f64 && p.y < image.height as f64
     };
     assert!(found.len() == 500 && found.pixels.iter().all(inside));
-    assert!(
-        found
-            .pixels
-            .iter()
-            .any(|p| p.y > 0.9 * picture.height as f64)
-    );
-    assert!(found == network.features(picture, 500), "equal pictures");
+    assert!(found.pixels.iter().any(|p| p.y > 0.9 * image.height as f64));
+    assert!(found == network.features(image, 500), "equal images");
     let grey = |width: usize, height: usize, n: usize| Grey {
         width,
         height,
@@ -286,7 +282,7 @@ fn a_scene_is_registered_by_the_network() {
 fn refusal(settings: &[&str]) -> String {
     let mut all = Settings::shipped();
     settings.iter().for_each(|s| all.merge_setting(s).unwrap());
-    let error = Finder::new(&all.params().unwrap().sfm).unwrap_err();
+    let error = FeatureExtractor::new(&all.params().unwrap().sfm.features()).unwrap_err();
     error.to_string()
 }
 

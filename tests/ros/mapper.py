@@ -70,13 +70,13 @@ def wait_until(condition, secs):
 
 
 class Observer:
-    """A node that spins on a thread and keeps what it hears."""
+    """A node that spins on a thread and keeps what it receives."""
 
     def __init__(self, name="observer"):
         self.node = rclpy.create_node(name)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.heard = {}
+        self.received = {}
         self.is_ending = False
         self.thread = threading.Thread(target=self.spin, daemon=True)
         self.thread.start()
@@ -87,7 +87,7 @@ class Observer:
 
     def listen(self, kind, topic, qos=10):
         """A list that grows with (monotonic seconds, message)."""
-        messages = self.heard.setdefault(topic, [])
+        messages = self.received.setdefault(topic, [])
         self.node.create_subscription(kind, topic, lambda m: messages.append((time.monotonic(), m)), qos)
         return messages
 

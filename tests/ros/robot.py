@@ -12,7 +12,7 @@ import numpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from mcap.reader import make_reader
-from PIL import Image as Picture
+from PIL import Image as PilImage
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
@@ -81,33 +81,33 @@ def image_payload(nanos, frame_id, pixels):
 
 
 def jpeg_of(payload):
-    """The picture inside a CompressedImage."""
+    """The image inside a CompressedImage."""
     return payload[payload.index(b"\xff\xd8") :]
 
 
 def raw_payload(compressed, nanos):
     """A CompressedImage as Image, rgb8."""
-    picture = Picture.open(io.BytesIO(jpeg_of(compressed))).convert("RGB")
-    return image_payload(nanos, CAMERA_FRAME, numpy.asarray(picture))
+    image = PilImage.open(io.BytesIO(jpeg_of(compressed))).convert("RGB")
+    return image_payload(nanos, CAMERA_FRAME, numpy.asarray(image))
 
 
 class Robot:
     """Publishes the recording on a thread of its own, at `rate` times its speed."""
 
-    def __init__(self, node, recording, picture_type=Image, with_odometry=True):
+    def __init__(self, node, recording, image_type=Image, with_odometry=True):
         self.node = node
         self.is_stopping = threading.Event()
         self.with_odometry = with_odometry
         self.n_sent = 0
         self.newest_nanos = 0
-        self.picture_type = picture_type
-        self.pictures = [(header_nanos(p), p) for p in recording["/camera/image_raw/compressed"]]
+        self.image_type = image_type
+        self.images = [(header_nanos(p), p) for p in recording["/camera/image_raw/compressed"]]
         self.info = recording["/camera/camera_info"][0]
         self.depths = {header_nanos(p): p for p in recording["/camera/depth"]}
         self.poses = {header_nanos(p): p for p in recording["/ground_truth/pose"]}
         publisher = node.create_publisher
-        suffix = "/compressed" if picture_type is CompressedImage else ""
-        self.to_picture = publisher(picture_type, f"/camera/image_raw{suffix}", SENSOR)
+        suffix = "/compressed" if image_type is CompressedImage else ""
+        self.to_image = publisher(image_type, f"/camera/image_raw{suffix}", SENSOR)
         self.to_info = publisher(CameraInfo, "/camera/camera_info", RELIABLE)
         self.to_depth = publisher(Image, "/camera/depth", SENSOR)
         self.to_pose = publisher(PoseStamped, "/ground_truth/pose", RELIABLE)
@@ -119,14 +119,14 @@ class Robot:
 
     def close(self):
         """Takes its publishers away."""
-        publishers = [self.to_picture, self.to_info, self.to_depth, self.to_pose]
+        publishers = [self.to_image, self.to_info, self.to_depth, self.to_pose]
         for publisher in [*publishers, self.to_tf, self.to_tf_static, self.to_clock]:
             self.node.destroy_publisher(publisher)
 
     def start(self, rate=1.0, from_ix=0, to_ix=None, offset_nanos=0):
         """`offset_nanos` is added to every stamp: later passes of the recording are later times."""
         self.is_stopping.clear()
-        arguments = (rate, self.pictures[from_ix:to_ix], offset_nanos)
+        arguments = (rate, self.images[from_ix:to_ix], offset_nanos)
         self.thread = threading.Thread(target=self.run, args=arguments, daemon=True)
         self.thread.start()
 
@@ -138,16 +138,16 @@ class Robot:
         if self.thread is not None:
             self.thread.join()
 
-    def run(self, rate, pictures, offset_nanos):
-        begin, first = time.monotonic(), pictures[0][0]
-        for nanos, payload in pictures:
+    def run(self, rate, images, offset_nanos):
+        begin, first = time.monotonic(), images[0][0]
+        for nanos, payload in images:
             ahead = (nanos - first) / 1e9 / rate - (time.monotonic() - begin)
             if self.is_stopping.wait(max(ahead, 0.0)):
                 return
             self.send(nanos, payload, nanos + offset_nanos)
 
     def send(self, nanos, payload, at):
-        """The picture that was taken at `nanos`, and all beside it, as if it had been taken at `at`."""
+        """The image that was taken at `nanos`, and all beside it, as if it had been taken at `at`."""
         self.to_clock.publish(Clock(clock=stamp_of(at)))
         pose = stamped(self.poses[nanos], at)
         if self.with_odometry:
@@ -155,8 +155,8 @@ class Robot:
         self.to_info.publish(stamped(self.info, at))
         self.to_pose.publish(pose)
         self.to_depth.publish(stamped(self.depths[nanos], at))
-        is_compressed = self.picture_type is CompressedImage
-        self.to_picture.publish(stamped(payload, at) if is_compressed else raw_payload(payload, at))
+        is_compressed = self.image_type is CompressedImage
+        self.to_image.publish(stamped(payload, at) if is_compressed else raw_payload(payload, at))
         self.n_sent += 1
         self.newest_nanos = at
 

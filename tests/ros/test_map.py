@@ -1,4 +1,4 @@
-"""What the node tells while it maps recordings/demo.mcap, and how it serves: poses, transforms, clouds, splats, services."""
+"""What the node reports while it maps recordings/demo.mcap, and how it serves: poses, transforms, clouds, splats, services."""
 
 import json
 import os
@@ -31,8 +31,8 @@ DEEP = QoSProfile(depth=2000)
 # Seconds that are added to the recording's stamps in its second pass.
 SECOND_PASS = 20
 # Small enough for two slow cores.
-SMALL = """source.max_side=320 map.max_side=160 map.sh_degree=0 map.max_splats=6000 map.seeds_per_keyframe=400 map.steps=100
-select.max_rate_hz=3 select.batch_size=4 select.batch_overlap=1 backend=cpu geometry=known
+SMALL = """source.max_side=320 train.max_side=160 train.sh_degree=0 map.max_splats=6000 train.seeds_per_keyframe=400 train.steps=100
+select.max_rate_hz=3 select.batch_size=4 select.batch_overlap=1 backend=cpu geometry=ground_truth
 source.pose_topic=/ground_truth/pose source.depth_topic=/camera/depth use_sim_time=true""".split()
 SOURCE = ["run", "--source", "ros2:/camera/image_raw"]
 
@@ -83,10 +83,10 @@ def points_of(cloud):
     return numpy.stack(columns, 1)
 
 
-def check_poses(heard, robot):
+def check_poses(received, robot):
     sent = {nanos + SECOND_PASS * 10**9: payload for nanos, payload in robot.poses.items()}
-    poses = [m for _, m in heard.pose if nanos_of(m.header.stamp) in sent]
-    check("poses come, at stamps of pictures, best effort", len(poses) > 5, len(poses))
+    poses = [m for _, m in received.pose if nanos_of(m.header.stamp) in sent]
+    check("poses come, at stamps of images, best effort", len(poses) > 5, len(poses))
     check("a pose is of the map frame", all(m.header.frame_id == "map" for m in poses))
     spread = [numpy.diag(numpy.reshape(m.pose.covariance, (6, 6))) for m in poses]
     check("each says how sure it is", all(numpy.isfinite(s).all() and (s > 0).all() for s in spread))
@@ -98,25 +98,25 @@ def check_poses(heard, robot):
     # The recording's world is odometry's frame here, and the poses are given: what is left is tracking.
     median = float(numpy.median(errors)) if errors else numpy.inf
     check("poses are the robot's, in metres", median < 0.1, f"median error {median:.3f} m")
-    moves = [m for _, m in heard.odometry]
+    moves = [m for _, m in received.odometry]
     named = {(m.header.frame_id, m.child_frame_id) for m in moves}
     check("odometry is of base_link in odom", named == {("odom", "base_link")}, named)
 
 
-def parents(heard):
+def parents(received):
     """Parents of each frame, over all that was broadcast."""
     found = {}
-    for _, message in [*heard.tf, *heard.tf_static]:
+    for _, message in [*received.tf, *received.tf_static]:
         for transform in message.transforms:
             found.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
     return found
 
 
-def check_transforms(heard):
-    found = parents(heard)
+def check_transforms(received):
+    found = parents(received)
     check("each frame has one parent", all(len(p) == 1 for p in found.values()), found)
     check("map is above odom, odom above base_link", found.get("odom") == {"map"} and found.get("base_link") == {"odom"})
-    own = [(at, m) for at, m in heard.tf if any(t.child_frame_id == "odom" for t in m.transforms)]
+    own = [(at, m) for at, m in received.tf if any(t.child_frame_id == "odom" for t in m.transforms)]
     children = {t.child_frame_id for _, m in own for t in m.transforms}
     check("the node sends map to odom and leaves odom to base_link to odometry", children == {"odom", "splat_map"}, children)
     times = [at for at, _ in own]
@@ -125,23 +125,23 @@ def check_transforms(heard):
     check("map to odom comes at 20 Hz or more", rate >= 20.0, f"{rate:.1f} Hz, {len(own)} messages")
 
 
-def check_clouds(heard):
-    path = heard.path[-1][1] if heard.path else Path()
+def check_clouds(received):
+    path = received.path[-1][1] if received.path else Path()
     check("the path is of the map frame and has the keyframes", path.header.frame_id == "map" and len(path.poses) > 3, len(path.poses))
-    cloud = heard.cloud[-1][1] if heard.cloud else PointCloud2()
+    cloud = received.cloud[-1][1] if received.cloud else PointCloud2()
     points = points_of(cloud) if cloud.data else numpy.zeros((0, 3))
     check("the cloud has points, finite, of the map frame", len(points) > 100 and numpy.isfinite(points).all() and cloud.header.frame_id == "map", len(points))
-    seen = heard.keyframe_cloud[-1][1] if heard.keyframe_cloud else PointCloud2()
+    seen = received.keyframe_cloud[-1][1] if received.keyframe_cloud else PointCloud2()
     ahead = points_of(seen) if seen.data else numpy.zeros((0, 3))
     check("a keyframe's cloud is of the camera's frame, ahead of it", len(ahead) > 100 and (ahead[:, 2] > 0).all() and seen.header.frame_id == CAMERA_FRAME, len(ahead))
 
 
-def check_stream(heard):
-    """Every whole snapshot and delta that was heard, put together as a client would."""
+def check_stream(received):
+    """Every whole snapshot and delta that was received, put together as a client would."""
     by_revision, deltas = {}, {}
-    for _, chunk in heard.splats:
+    for _, chunk in received.splats:
         by_revision.setdefault((bytes(chunk.map_id), chunk.revision), []).append(chunk)
-    for _, piece in heard.delta:
+    for _, piece in received.delta:
         deltas.setdefault((bytes(piece.map_id), piece.revision), []).append(piece)
     wholes = {key: chunks for key, chunks in by_revision.items() if len(chunks) == chunks[0].n_chunks}
     check("whole snapshots come in pieces", len(wholes) > 0, f"{len(wholes)} of {len(by_revision)} complete")
@@ -155,7 +155,7 @@ def check_stream(heard):
         elif len(deltas[key]) == deltas[key][0].n_pieces and client.delta(deltas[key]):
             n_followed += 1
             good &= client.digest() == bytes(deltas[key][0].map_sha256)
-    check("splats put together have the digest that was told", good and wholes, f"{n_followed} deltas")
+    check("splats put together have the digest that was announced", good and wholes, f"{n_followed} deltas")
     first = next(iter(wholes.values()), [None])[0]
     check("a chunk's checksum fits", first is not None and crc32c(bytes(first.data)) == first.crc32c)
 
@@ -197,9 +197,15 @@ def check_services(observer):
     view = observer.call(RenderView, "/splat_mapper/render_view", request)
     fits = len(view.image.data) == 80 * 60 * 3 and len(view.depth.data) == 80 * 60 * 4
     check("render_view renders, with depth", view.success and fits and view.image.encoding == "rgb8", view.message)
+    for frame, is_known in [("map", True), ("splat_map", True), ("base_link", False)]:
+        request.header.frame_id = frame
+        view = observer.call(RenderView, "/splat_mapper/render_view", request)
+        check(f"render_view with a pose in {frame}: {is_known}", view.success == is_known, view.message)
+    check("render_view names the frames it knows", "splat_map" in view.message, view.message)
+    request.header.frame_id = ""
     request.camera.width = 100_000
     huge = observer.call(RenderView, "/splat_mapper/render_view", request)
-    check("render_view refuses a huge picture", not huge.success, huge.message)
+    check("render_view refuses a huge image", not huge.success, huge.message)
 
     manifest, digest = fetch(observer)
     check("get_splats brings the published map", digest == bytes(manifest.map_sha256) and manifest.n_splats > 0, manifest.n_splats)
@@ -207,9 +213,9 @@ def check_services(observer):
     check("get_splats says when a revision is gone", not gone.success, gone.message)
 
 
-def check_switches(observer, heard, robot, mapper):
+def check_switches(observer, received, robot, mapper):
     call = lambda name: observer.call(Trigger, f"/splat_mapper/{name}", Trigger.Request())  # noqa: E731
-    state = lambda: heard.status[-1][1].state if heard.status else None  # noqa: E731
+    state = lambda: received.status[-1][1].state if received.status else None  # noqa: E731
     robot.start(rate=1.0, to_ix=40)
     paused = call("pause")
     check("pause pauses", paused.success and wait_until(lambda: state() == MapperStatus.STATE_PAUSED, 5.0), paused.message)
@@ -220,38 +226,38 @@ def check_switches(observer, heard, robot, mapper):
     robot.wait()
 
 
-def check_late(heard):
+def check_late(received):
     late = Observer("late")
-    late_heard = Listening(late)
+    late_received = Listening(late)
     latched = ["path", "cloud", "manifest", "keyframes", "status"]
-    wait_until(lambda: all(getattr(late_heard, name) for name in latched), 5.0)
-    missing = [name for name in latched if not getattr(late_heard, name)]
+    wait_until(lambda: all(getattr(late_received, name) for name in latched), 5.0)
+    missing = [name for name in latched if not getattr(late_received, name)]
     check("who comes late gets what is latched", not missing, missing)
     late.close()
-    check("the status counts", heard.status[-1][1].frames_received > 0 and heard.status[-1][1].keyframes_placed > 0)
+    check("the status counts", received.status[-1][1].frames_received > 0 and received.status[-1][1].keyframes_registered > 0)
 
 
 def with_odometry(observer, recording):
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True)
-    words = [*SMALL, f"publish.folder={OUT / 'maps'}", "publish.full_secs=4", "map.snapshot_secs=1", "publish.linger_secs=60"]
+    words = [*SMALL, f"publish.map_directory={OUT / 'maps'}", "publish.full_map_period=4", "map.snapshot_secs=1", "publish.shutdown_delay=60"]
     mapper = Mapper(*SOURCE, "--out", str(OUT / "run"), *settings(*words), log="map.log")
-    heard = Listening(observer)
+    received = Listening(observer)
     mapper.wait_for_log("ROS 2 node")
     robot = Robot(observer.node, recording)
     wait_until(lambda: robot.to_info.get_subscription_count() > 0, 5.0)
-    check_switches(observer, heard, robot, mapper)
+    check_switches(observer, received, robot, mapper)
     robot.start(rate=1.0, offset_nanos=SECOND_PASS * 10**9)
-    check("diagnostics are fine while pictures come", wait_until(lambda: heard.level("input") == 0, 5.0))
+    check("diagnostics are fine while images come", wait_until(lambda: received.level("input") == 0, 5.0))
     robot.wait()
-    check("diagnostics warn when the camera stops", wait_until(lambda: heard.level("input") == 1, 6.0))
-    check("and call it an error after a while", wait_until(lambda: heard.level("input") == 2, 10.0), heard.level("input"))
-    placed = wait_until(lambda: heard.cloud and heard.status[-1][1].splats > 0, 60.0)
-    check("a map has come", placed, f"{heard.status[-1][1].splats} splats")
-    check_poses(heard, robot)
-    check_transforms(heard)
-    check_clouds(heard)
-    check_late(heard)
+    check("diagnostics warn when the camera stops", wait_until(lambda: received.level("input") == 1, 6.0))
+    check("and call it an error after a while", wait_until(lambda: received.level("input") == 2, 10.0), received.level("input"))
+    has_map = wait_until(lambda: received.cloud and received.status[-1][1].splats > 0, 60.0)
+    check("a map has come", has_map, f"{received.status[-1][1].splats} splats")
+    check_poses(received, robot)
+    check_transforms(received)
+    check_clouds(received)
+    check_late(received)
     check_services(observer)
     # Time jumps back: the input ends, and the last map goes out whole.
     robot.start(to_ix=3)
@@ -261,14 +267,14 @@ def with_odometry(observer, recording):
     manifest, digest = fetch(observer)
     saved = json.loads(report.read_text())["map_sha256"]
     check("splats that were sent are the map that was saved", digest.hex() == saved == bytes(manifest.map_sha256).hex(), saved[:16])
-    check_stream(heard)
+    check_stream(received)
     code, secs = mapper.end()
     check("SIGINT ends it, cleanly", code == 0 and secs <= 2.0, f"exit {code} after {secs:.2f} s")
     robot.wait()
 
 
 def without_odometry(observer, recording):
-    """Compressed pictures, another name, and nothing else on tf: the node sends the whole tree."""
+    """Compressed images, another name, and nothing else on tf: the node sends the whole tree."""
     arguments = ["--ros-args", "-r", "__ns:=/bot", "-r", "__node:=mapper", "-r", "~/odometry:=/where"]
     mapper = Mapper(*SOURCE, *settings(*SMALL), *arguments, log="map_alone.log")
     mapper.wait_for_log("ROS 2 node")
@@ -276,8 +282,8 @@ def without_odometry(observer, recording):
     begin = len(tf)
     poses = observer.listen(PoseWithCovarianceStamped, "/bot/mapper/pose")
     remapped = observer.listen(Odometry, "/where")
-    robot = Robot(observer.node, recording, picture_type=CompressedImage, with_odometry=False)
-    wait_until(lambda: robot.to_picture.get_subscription_count() > 0, 5.0)
+    robot = Robot(observer.node, recording, image_type=CompressedImage, with_odometry=False)
+    wait_until(lambda: robot.to_image.get_subscription_count() > 0, 5.0)
     # There and back again: poses come once the first keyframes are mapped, however long that takes.
     for n in range(8):
         robot.start(rate=1.0, offset_nanos=n * SECOND_PASS * 10**9)

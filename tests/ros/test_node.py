@@ -1,4 +1,4 @@
-"""What the node is to ROS 2 before it maps anything: names, parameters, lifecycle, silence, jumps of time, lost pictures."""
+"""What the node is to ROS 2 before it maps anything: names, parameters, lifecycle, silence, jumps of time, lost images."""
 
 import json
 import os
@@ -48,14 +48,14 @@ def word(name, value):
 def names_and_arguments(observer):
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
         file.write("splat_mapper:\n  ros__parameters:\n    map:\n      max_splats: 1234\n")
-        file.write("mapper:\n  ros__parameters:\n    source: {max_side: 128}\n    map.sh_degree: 2\n")
+        file.write("mapper:\n  ros__parameters:\n    source: {max_side: 128}\n    train.sh_degree: 2\n")
         file.flush()
-        arguments = ["--ros-args", "-r", "__ns:=/bot", "-r", "__node:=mapper", "-p", "map.steps:=77"]
+        arguments = ["--ros-args", "-r", "__ns:=/bot", "-r", "__node:=mapper", "-p", "train.steps:=77"]
         arguments += ["--params-file", file.name]
         mapper = Mapper(*SOURCE, *IDLE, *arguments, log="names.log")
         check("a node under another name comes up", mapper.wait_for_log("mapper in namespace /bot"))
         request = GetParameters.Request(
-            names=["map.steps", "source.max_side", "map.sh_degree", "map.max_splats", "no.such"]
+            names=["train.steps", "source.max_side", "train.sh_degree", "map.max_splats", "no.such"]
         )
         values = observer.call(GetParameters, "/bot/mapper/get_parameters", request).values
         found = [v.integer_value for v in values[:4]] + [values[4].type]
@@ -63,9 +63,9 @@ def names_and_arguments(observer):
         check("an unknown parameter is not set", found[4] == ParameterType.PARAMETER_NOT_SET)
     code, secs = mapper.end()
     is_said = "stopped before there was a map" in mapper.log()
-    check("without a picture it ends at once, and says that there is no map", code == 0 and is_said and secs < 2.0, f"{code}, {secs:.2f} s")
+    check("without an image it ends at once, and says that there is no map", code == 0 and is_said and secs < 2.0, f"{code}, {secs:.2f} s")
     for arguments, expected in [
-        (["-p", "map.steps:=-1"], "parameter map.steps = -1 is out of range"),
+        (["-p", "train.steps:=-1"], "parameter train.steps = -1 is out of range"),
         (["-p", "map.stepps:=1"], "unknown parameter"),
         (["-r", "what is this"], "ROS 2 does not start"),
     ]:
@@ -80,12 +80,12 @@ def parameters(observer):
     mapper.wait_for_log(UP)
     service = "/splat_mapper/"
     listed = observer.call(ListParameters, service + "list_parameters", ListParameters.Request()).result
-    check("all parameters are listed", len(listed.names) > 100 and "map.steps" in listed.names, len(listed.names))
+    check("all parameters are listed", len(listed.names) > 100 and "train.steps" in listed.names, len(listed.names))
     below = ListParameters.Request(prefixes=["ros2"], depth=1)
     below = observer.call(ListParameters, service + "list_parameters", below).result.names
     check("parameters are listed by prefix", below and all(n.startswith("ros2.") for n in below), len(below))
 
-    request = DescribeParameters.Request(names=["map.steps", "ros2.silence_secs", "backend"])
+    request = DescribeParameters.Request(names=["train.steps", "ros2.image_timeout", "backend"])
     steps, silence, backend = observer.call(
         DescribeParameters, service + "describe_parameters", request
     ).descriptors
@@ -94,20 +94,20 @@ def parameters(observer):
     check("a choice says of what", "wgpu" in backend.additional_constraints and backend.description, backend.additional_constraints)
 
     events = observer.listen(ParameterEvent, "/parameter_events")
-    cases = [number("ros2.silence_secs", 0.5), number("ros2.silence_secs", -1.0), whole("map.steps", 5)]
-    cases += [word("no.such", "x"), word("ros2.silence_secs", "soon")]
+    cases = [number("ros2.image_timeout", 0.5), number("ros2.image_timeout", -1.0), whole("train.steps", 5)]
+    cases += [word("no.such", "x"), word("ros2.image_timeout", "soon")]
     results = observer.call(SetParameters, service + "set_parameters", SetParameters.Request(parameters=cases)).results
     check("of several parameters, the good one is set", [r.successful for r in results] == [True] + [False] * 4)
     reasons = [r.reason for r in results[1:]]
     for reason, expected in zip(reasons, ["out of range", "start", "unknown", "out of range"]):
         check(f"a refusal says why ({expected})", expected in reason, reason)
-    told = wait_until(lambda: any(e.changed_parameters for _, e in events), 5.0)
-    check("a change is told on /parameter_events", told)
-    both = SetParametersAtomically.Request(parameters=[number("ros2.silence_secs", 9.0), whole("seed", 5)])
+    reported = wait_until(lambda: any(e.changed_parameters for _, e in events), 5.0)
+    check("a change is reported on /parameter_events", reported)
+    both = SetParametersAtomically.Request(parameters=[number("ros2.image_timeout", 9.0), whole("seed", 5)])
     both = observer.call(SetParametersAtomically, service + "set_parameters_atomically", both).result
-    now = observer.call(GetParameters, service + "get_parameters", GetParameters.Request(names=["ros2.silence_secs"]))
+    now = observer.call(GetParameters, service + "get_parameters", GetParameters.Request(names=["ros2.image_timeout"]))
     check("atomically, all are set or none", not both.successful and now.values[0].double_value == 0.5, both.reason)
-    check("silence is told after the time that was set", mapper.wait_for_log("nobody publishes \"/camera/image_raw\"", 5.0))
+    check("silence is reported after the time that was set", mapper.wait_for_log("nobody publishes \"/camera/image_raw\"", 5.0))
     mapper.end()
 
 
@@ -137,8 +137,8 @@ def lifecycle(observer):
     )
     labels = [t.transition.label for t in possible.available_transitions]
     check("the steps from here are listed", labels == ["deactivate", "shutdown"], labels)
-    told = wait_until(lambda: len(events) == len(walk), 5.0)
-    check("each step is told", told and events[-1][1].goal_state.label == "active", len(events))
+    reported = wait_until(lambda: len(events) == len(walk), 5.0)
+    check("each step is reported", reported and events[-1][1].goal_state.label == "active", len(events))
     check("shutdown by label is done", change(label="shutdown"))
     ended = wait_until(lambda: mapper.process.poll() is not None, 5.0)
     check("and ends the process", ended, mapper.process.poll())
@@ -146,26 +146,26 @@ def lifecycle(observer):
 
 
 def silence(observer, recording):
-    arguments = ["--set", "ros2.reliability=reliable", "--set", "ros2.silence_secs=0.5"]
+    arguments = ["--set", "ros2.reliability=reliable", "--set", "ros2.image_timeout=0.5"]
     mapper = Mapper(*SOURCE, *IDLE, *arguments, log="silence.log")
     mapper.wait_for_log(UP)
-    check("no publisher is told", mapper.wait_for_log("nobody publishes \"/camera/image_raw\"", 5.0))
+    check("no publisher is reported", mapper.wait_for_log("nobody publishes \"/camera/image_raw\"", 5.0))
     robot = Robot(observer.node, recording, with_odometry=False)
     robot.start(to_ix=20)
-    check("QoS that does not suit is told", mapper.wait_for_log("set it to best_effort", 5.0))
+    check("QoS that does not suit is reported", mapper.wait_for_log("set it to best_effort", 5.0))
     robot.stop()
     robot.close()
     mapper.end()
 
-    mapper = Mapper(*SOURCE, *IDLE, "--set", "ros2.image_transport=compressed", "--set", "ros2.silence_secs=0.5", log="transport.log")
-    check("compressed pictures are subscribed beside the topic", mapper.wait_for_log("/camera/image_raw/compressed is subscribed"))
+    mapper = Mapper(*SOURCE, *IDLE, "--set", "ros2.image_transport=compressed", "--set", "ros2.image_timeout=0.5", log="transport.log")
+    check("compressed images are subscribed beside the topic", mapper.wait_for_log("/camera/image_raw/compressed is subscribed"))
     mapper.end()
     late = Mapper("run", "--source", "ros2:/late/image_raw", *IDLE, log="late.log")
     late.wait_for_log(UP)
     publisher = observer.node.create_publisher(CompressedImage, "/late/image_raw/compressed", SENSOR)
     found = late.wait_for_log("/late/image_raw/compressed is subscribed as sensor_msgs/msg/CompressedImage", 5.0)
     check("a publisher that comes late is found, and what it sends", found)
-    # A picture that is sent before both sides know of each other is lost.
+    # An image that is sent before both sides know of each other is lost.
     wait_until(lambda: publisher.get_subscription_count() > 0, 5.0)
     publisher.publish(recording["/camera/image_raw/compressed"][0])
     check("a camera without CameraInfo is waited for, then taken as uncalibrated", late.wait_for_log("counts as uncalibrated", 6.0))
@@ -175,8 +175,8 @@ def silence(observer, recording):
 
 def doctor(observer, recording):
     robot = Robot(observer.node, recording)
-    told = subprocess.run([os.environ["SPLAT_MAPPER"], "doctor"], capture_output=True, text=True, check=False, cwd=ROOT).stdout
-    found = [line for line in told.splitlines() if "ros 2 pictures" in line]
+    printed = subprocess.run([os.environ["SPLAT_MAPPER"], "doctor"], capture_output=True, text=True, check=False, cwd=ROOT).stdout
+    found = [line for line in printed.splitlines() if "ros 2 images" in line]
     wanted = "/camera/image_raw (sensor_msgs/msg/Image, best effort, by /observer, with CameraInfo)"
     check("doctor sees the camera, how it publishes, and its calibration", any(wanted in line for line in found), found)
     robot.close()
@@ -190,10 +190,10 @@ def time_jumps(observer, recording):
         mapper = Mapper(*SOURCE, *IDLE, "--set", f"ros2.on_time_jump={action}", "--set", "use_sim_time=true", log=f"jump_{action}.log")
         mapper.wait_for_log(UP)
         robot = Robot(observer.node, recording)
-        wait_until(lambda: robot.to_picture.get_subscription_count() > 0, 5.0)
+        wait_until(lambda: robot.to_image.get_subscription_count() > 0, 5.0)
         robot.start(from_ix=60, to_ix=65)
         robot.wait()
-        mapper.wait_for_log("first picture", 5.0)
+        mapper.wait_for_log("first image", 5.0)
         robot.start(to_ix=5)
         robot.wait()
         check(f"time that jumps back: {action}", mapper.wait_for_log(expected, 5.0))
@@ -206,7 +206,7 @@ def time_jumps(observer, recording):
 def throughput(observer):
     """640 x 480 rgb8 at 30 Hz, best effort: none is lost on the way into the node."""
     out = tempfile.mkdtemp()
-    arguments = ["--out", out, "--set", "source.max_frames=0", "--set", "ros2.calibration_secs=0"]
+    arguments = ["--out", out, "--set", "source.max_frames=0", "--set", "ros2.camera_info_timeout=0"]
     mapper = Mapper(*SOURCE, *IDLE, *arguments, log="throughput.log")
     mapper.wait_for_log(UP)
     publisher = observer.node.create_publisher(Image, "/camera/image_raw", SENSOR)
@@ -225,7 +225,7 @@ def throughput(observer):
     mapper.end()
     frames = json.load(open(f"{out}/report.json"))["frames"]
     figures = f"{N_THROUGHPUT} sent in {secs:.1f} s ({1e3 * took / N_THROUGHPUT:.2f} ms each), {frames}"
-    check("no picture is lost on its way", frames["received"] == N_THROUGHPUT, figures)
+    check("no image is lost on its way", frames["received"] == N_THROUGHPUT, figures)
     observer.node.destroy_publisher(publisher)
 
 

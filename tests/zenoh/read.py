@@ -52,10 +52,10 @@ def expect(is_so, what):
 
 def decode(key, payload):
     """A sample by its key alone: .../pkg::msg::dds_::Name_/RIHS01_hash."""
-    spelled, told = key.rsplit("/", 2)[1:]
+    spelled, type_hash = key.rsplit("/", 2)[1:]
     package, kind, _, name = spelled.split("::")
     ros_type = f"{package}/{kind}/{name.rstrip('_')}"
-    return ros_type, told, STORE.deserialize_cdr(payload, ros_type)
+    return ros_type, type_hash, STORE.deserialize_cdr(payload, ros_type)
 
 
 def open_session(endpoint):
@@ -73,7 +73,7 @@ def free_port():
         return s.getsockname()[1]
 
 
-class Heard:
+class Received:
     """All samples by topic, in order."""
 
     def __init__(self):
@@ -113,8 +113,8 @@ def ask(session, service, request, fields):
     tokens = [str(t.ok.key_expr) for t in session.liveliness().get(f"@ros2_lv/0/**") if t.ok is not None]
     mine = [t for t in tokens if f"%splat_mapper%{kind}/" in t and "/SS/" in t]
     expect_quietly(len(mine) == 1, f"{kind} has one token")
-    told = mine[0].split("/")[-2]
-    key = f"0/splat_mapper/{kind}/{package}/{told}"
+    type_hash = mine[0].split("/")[-2]
+    key = f"0/splat_mapper/{kind}/{package}/{type_hash}"
     stamp = struct.pack("<qqB", 7, 0, 16) + bytes(range(16))
     replies = [r for r in session.get(key, payload=body, attachment=stamp, timeout=40.0)]
     expect_quietly(len(replies) == 1 and replies[0].ok is not None, f"{kind} answers once")
@@ -155,37 +155,37 @@ def sha_of_chunks(chunks):
     return digest.hexdigest()
 
 
-def check_topics(heard, report, map_frame="map"):
+def check_topics(received, report, map_frame="map"):
     for name in ["pose", "odometry", "path", "cloud", "keyframe_cloud", "frusta", "keyframes", "splats",
                  "splats/manifest", "status"]:
-        key, payloads = heard.of(name)
-        ros_type, told, _ = decode(key, payloads[0])
-        expect(STORE.hash_rihs01(ros_type) == told, f"{name}: type hash of {ros_type} as rosbags has it")
+        key, payloads = received.of(name)
+        ros_type, type_hash, _ = decode(key, payloads[0])
+        expect(STORE.hash_rihs01(ros_type) == type_hash, f"{name}: type hash of {ros_type} as rosbags has it")
     for topic in ["0/tf/", "0/diagnostics/"]:
-        expect(any(key.startswith(topic) for key in heard.topics), f"{topic} came")
-    _, poses = heard.of("pose")
-    key, _ = heard.of("pose")
+        expect(any(key.startswith(topic) for key in received.topics), f"{topic} came")
+    _, poses = received.of("pose")
+    key, _ = received.of("pose")
     poses = [decode(key, p)[2] for p in poses]
     expect(poses[-1].header.frame_id == map_frame, "poses are in the map frame")
     variances = numpy.array(poses[-1].pose.covariance).reshape(6, 6)
     expect(numpy.all(numpy.linalg.eigvalsh(variances) > 0), "a pose's covariance is positive definite")
-    key, paths = heard.of("path")
+    key, paths = received.of("path")
     path = decode(key, paths[-1])[2]
     expect(len(path.poses) == report["keyframes"]["registered"], "the path has all keyframes")
-    key, clouds = heard.of("cloud")
+    key, clouds = received.of("cloud")
     cloud = decode(key, clouds[-1])[2]
     names = [field.name for field in cloud.fields]
     expect(names[:3] == ["x", "y", "z"], "the cloud has x y z")
     points = numpy.frombuffer(bytes(cloud.data), dtype=numpy.float32).reshape(cloud.width, -1)[:, :3]
     expect(cloud.width > 100 and numpy.isfinite(points).all(), f"the cloud's {cloud.width} points are finite")
-    key, chunks = heard.of("splats")
+    key, chunks = received.of("splats")
     chunks = [decode(key, p)[2] for p in chunks]
     last = [c for c in chunks if c.revision == chunks[-1].revision]
     expect(len(last) == last[0].n_chunks, "all chunks of the last snapshot came")
     expect(sha_of_chunks(last) == report["map_sha256"], "their hash is the saved map's")
     transforms = {}
-    for key in [k for k in heard.topics if k.startswith("0/tf/")]:
-        for payload in heard.topics[key]:
+    for key in [k for k in received.topics if k.startswith("0/tf/")]:
+        for payload in received.topics[key]:
             for link in decode(key, payload)[2].transforms:
                 transforms.setdefault(link.child_frame_id, set()).add(link.header.frame_id)
     expect(all(len(parents) == 1 for parents in transforms.values()), f"one parent each: {transforms}")
@@ -194,7 +194,7 @@ def check_topics(heard, report, map_frame="map"):
 def check_services(session, report):
     answer = own("get_splats", "GetSplats", {"revision": 0, "first_chunk": 0, "max_chunks": 0}, session)
     manifest = answer.manifest
-    expect(answer.success and bytes(manifest.map_sha256).hex() == report["map_sha256"], "get_splats tells the hash")
+    expect(answer.success and bytes(manifest.map_sha256).hex() == report["map_sha256"], "get_splats gives the hash")
     chunks = []
     while len(chunks) < manifest.n_chunks:
         fields = {"revision": manifest.revision, "first_chunk": len(chunks), "max_chunks": 100}
@@ -216,16 +216,20 @@ def check_services(session, report):
         position=types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0),
         orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
     )
-    def seen(width, height):
+    def seen(width, height, frame=""):
         k = numpy.array([width, 0, width / 2, 0, width, height / 2, 0, 0, 1], dtype=numpy.float64)
         info = info_type(header=header, height=height, width=width, distortion_model="", d=numpy.zeros(0), k=k,
                          r=numpy.zeros(9), p=numpy.zeros(12), binning_x=0, binning_y=0, roi=roi)
-        fields = {"pose": pose, "camera": info, "with_depth": True}
+        asked = types["std_msgs/msg/Header"](stamp=header.stamp, frame_id=frame)
+        fields = {"header": asked, "pose": pose, "camera": info, "with_depth": True}
         return own("render_view", "RenderView", fields, session)
-    picture = seen(64, 48)
-    expect(picture.success and len(picture.image.data) == 64 * 48 * 3 and len(picture.depth.data) == 64 * 48 * 4,
-           f"render_view shows something of mean {numpy.mean(picture.image.data):.0f}")
+    image = seen(64, 48)
+    expect(image.success and len(image.image.data) == 64 * 48 * 3 and len(image.depth.data) == 64 * 48 * 4,
+           f"render_view shows something of mean {numpy.mean(image.image.data):.0f}")
     expect(not seen(100_000, 48).success and not seen(0, 0).success, "render_view refuses sizes that are none")
+    expect(seen(64, 48, "map").success and seen(64, 48, "splat_map").success, "render_view takes poses in map and splat_map")
+    unknown = seen(64, 48, "odom")
+    expect(not unknown.success and "splat_map" in unknown.message, f"render_view names the frames it knows: {unknown.message}")
     expect(trigger("pause", session) and trigger("resume", session), "pause and resume")
 
 
@@ -279,14 +283,14 @@ def main():
     out, endpoint = WORK / "out", f"tcp/127.0.0.1:{free_port()}"
     recording = WORK / "sent.mcap"
     settings = ["publish.zenoh=true", "publish.scouting=false", f"publish.zenoh_listen={endpoint}",
-                f"publish.folder={WORK / 'files'}", f"publish.record={recording}", "publish.linger_secs=600",
-                "map.snapshot_secs=0.5", "publish.full_secs=3"]
+                f"publish.map_directory={WORK / 'files'}", f"publish.record={recording}", "publish.shutdown_delay=600",
+                "map.snapshot_secs=0.5", "publish.full_map_period=3"]
     command = [BINARY, "replay", RECORDING, "--out", str(out), "--max-side", "240", "--steps", "300"]
     for setting in settings:
         command += ["--set", setting]
     node = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
-        session, heard = None, Heard()
+        session, received = None, Received()
         start = time.monotonic()
         while session is None:
             try:
@@ -295,19 +299,19 @@ def main():
             except OSError:
                 expect_quietly(time.monotonic() - start < PATIENCE_S, "the node listens")
                 time.sleep(0.1)
-        subscribers = [session.declare_subscriber(key, heard.take) for key in ["0/splat_mapper/**", "0/tf/**", "0/diagnostics/**"]]
+        subscribers = [session.declare_subscriber(key, received.take) for key in ["0/splat_mapper/**", "0/tf/**", "0/diagnostics/**"]]
         while not (out / "report.json").exists():
             expect_quietly(node.poll() is None, "the node runs")
             expect_quietly(time.monotonic() - start < PATIENCE_S, "the node ends its run")
             time.sleep(0.2)
         report = json.loads((out / "report.json").read_text())
         time.sleep(1.0)
-        check_topics(heard, report)
+        check_topics(received, report)
         tokens = [str(t.ok.key_expr) for t in session.liveliness().get("@ros2_lv/0/**") if t.ok is not None]
-        keys.check(tokens, list(heard.topics), session, expect)
-        deltas = [k for k in heard.topics if "/splats/delta/" in k]
+        keys.check(tokens, list(received.topics), session, expect)
+        deltas = [k for k in received.topics if "/splats/delta/" in k]
         if deltas:
-            key, payloads = deltas[0], heard.topics[deltas[0]]
+            key, payloads = deltas[0], received.topics[deltas[0]]
             expect(STORE.hash_rihs01(decode(key, payloads[0])[0]) == key.rsplit("/", 1)[1], "type hash of deltas")
             bytes_of_map = report["splats"] * 96
             share = max(len(p) for p in payloads) / bytes_of_map

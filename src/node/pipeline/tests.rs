@@ -1,10 +1,11 @@
 use std::sync::mpsc::{Receiver as Signals, SyncSender as Signal, sync_channel};
 
-use super::*;
-use crate::config::Settings;
-use crate::geometry::GeometryBatch;
-use crate::node::Stop;
-use crate::source;
+use crate::node::engines::Engines;
+use crate::node::open_source;
+use crate::node::pipeline::*;
+use crate::node::stop::Stop;
+use crate::params::settings::Settings;
+use splat_geometry::answer::GeometryBatch;
 
 /// Longer than anything here takes on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -41,12 +42,13 @@ fn a_stop_does_not_wait_for_geometry_that_is_at_work() {
     let params = settings.params().expect("fits");
     let stop = Stop::default();
     let job = Job {
-        source: source::open("synthetic:room", &params.source, 0).expect("always there"),
+        source: open_source::open("synthetic:room", &params.source, 0).expect("always there"),
         params,
         is_live: false,
         stop: stop.clone(),
         out: None,
-        outbox: None,
+        publisher: None,
+        engines: Engines::default(),
     };
     let ((entered_tx, entered), (release, released)) = (sync_channel(4), sync_channel(0));
     let model = Box::new(Stuck {

@@ -1,0 +1,40 @@
+//! Streams of keyframes -> camera poses, intrinsics and dense depth: structure from motion with multi-view stereo, windows of
+//! a 3D foundation model aligned with each other, or ground truth.
+
+pub mod answer;
+
+pub mod ransac;
+
+pub mod pnp;
+
+pub mod similarity;
+
+pub mod stats;
+
+pub mod shared_library;
+
+pub mod inference;
+
+pub mod error;
+
+pub mod model;
+
+pub mod mvs;
+
+pub mod optim;
+
+pub mod loop_closure;
+
+pub mod two_view;
+
+pub mod features;
+
+pub mod matching;
+
+pub mod sfm;
+
+pub mod alignment;
+
+pub mod foundation;
+
+pub mod ground_truth;

@@ -1,0 +1,237 @@
+//! Registered keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use crate::answer::{GeometryBatch, Observations, PoseStd, PoseUpdate, View};
+use crate::mvs::depth_stream::DepthStream;
+use crate::mvs::neighbours::depth_range;
+use crate::mvs::params::MvsParams;
+use crate::mvs::view::MvsView;
+use crate::sfm::updates::{SparseBatch, SparseView};
+use splat_gpu::error::GpuError;
+use splat_image::undistort::Undistorter;
+use splat_types::camera::CameraModel;
+use splat_types::depth::DepthMap;
+use splat_types::image::RgbImage;
+
+/// Images and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
+const MAX_HELD: usize = 32;
+/// Views that wait for a better depth, the newest.
+const MAX_AGAIN: usize = 4;
+/// Poses that moved its pixels by more since the sweep make a depth map out of date.
+const MAX_DRIFT_PX: f64 = 1.0;
+
+/// Stereo for a stream of keyframes.
+#[derive(Debug)]
+pub(crate) struct Densifier {
+    params: MvsParams,
+    state: DepthStream,
+    /// Of all views so far: the lens by which the image was undistorted.
+    lenses: BTreeMap<u32, Option<CameraModel>>,
+    /// Views whose poses were reported: those without depth, and those whose depth may be better by now.
+    waiting: VecDeque<SparseView>,
+    again: VecDeque<SparseView>,
+}
+
+impl Densifier {
+    pub(crate) fn new(params: &MvsParams) -> Result<Self, GpuError> {
+        Ok(Self {
+            params: params.clone(),
+            state: DepthStream::new(params.clone(), MAX_HELD)?,
+            lenses: BTreeMap::new(),
+            waiting: VecDeque::new(),
+            again: VecDeque::new(),
+        })
+    }
+
+    /// `image_of` gives the image of a keyframe.
+    pub(crate) fn densify(
+        &mut self,
+        sparse: &SparseBatch,
+        image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
+    ) -> GeometryBatch {
+        self.take_in(sparse, image_of);
+        for view in &sparse.views {
+            self.sweep(view);
+        }
+        let views = sparse.views.iter().map(|view| self.view(view)).collect();
+        reported(sparse, views)
+    }
+
+    /// The poses of a batch; its depth comes by `next`.
+    pub(crate) fn poses(
+        &mut self,
+        sparse: SparseBatch,
+        image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
+    ) -> GeometryBatch {
+        self.take_in(&sparse, image_of);
+        for revision in &sparse.revised {
+            let waiting = self.waiting.iter_mut().chain(&mut self.again);
+            for view in waiting.filter(|view| view.keyframe_id == revision.keyframe_id) {
+                move_to(view, revision);
+            }
+        }
+        let without_depth = |view| registered(view, DepthMap::none());
+        let reported = reported(&sparse, sparse.views.iter().map(without_depth).collect());
+        for view in sparse.views {
+            let is_other = |other: &SparseView| other.keyframe_id != view.keyframe_id;
+            self.waiting.retain(is_other);
+            self.again.retain(is_other);
+            if self.state.n_sources(view.keyframe_id) == 0 {
+                self.waiting.push_back(view);
+            } else {
+                self.again.push_back(view);
+            }
+        }
+        while self.again.len() > MAX_AGAIN {
+            self.again.pop_front();
+        }
+        while self.waiting.len() > MAX_HELD {
+            self.waiting.pop_front();
+        }
+        reported
+    }
+
+    /// Views without depth so far.
+    pub(crate) fn n_waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// One more view with depth, of those whose poses were reported: the newest, since frames are tracked by it.
+    pub(crate) fn next(&mut self) -> Option<View> {
+        let view = self.waiting.pop_back().or_else(|| self.again.pop_front())?;
+        self.sweep(&view);
+        Some(self.view(&view))
+    }
+
+    fn take_in(&mut self, sparse: &SparseBatch, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
+        for revision in &sparse.revised {
+            let id = revision.keyframe_id;
+            if self.state.holds(id) {
+                self.state
+                    .revise(id, revision.intrinsics, revision.submap_from_cam);
+            }
+        }
+        // All images first: the views of one batch are each other's best sources.
+        for view in &sparse.views {
+            self.hold(view, image_of);
+        }
+    }
+
+    /// Whether its image is still there to be matched again.
+    pub(crate) fn holds(&self, keyframe_id: u32) -> bool {
+        self.state.holds(keyframe_id)
+    }
+
+    fn hold(&mut self, view: &SparseView, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
+        let (id, submap_from_cam) = (view.keyframe_id, view.submap_from_cam);
+        match self.lenses.get(&id) {
+            // Let go long ago.
+            Some(_) if !self.state.holds(id) => (),
+            Some(lens) if *lens == view.lens => {
+                self.state.revise(id, view.intrinsics, submap_from_cam);
+            }
+            _ => {
+                let Some(image) = image_of(id).and_then(|image| undistorted(image, view)) else {
+                    return;
+                };
+                let rgb_image = MvsView {
+                    image,
+                    intrinsics: view.intrinsics,
+                    submap_from_cam,
+                };
+                self.state.add(id, &rgb_image, 1.0, 2.0, &[]);
+                self.lenses.insert(id, view.lens);
+            }
+        }
+    }
+
+    /// Sweeps a new view, and one swept before when it had too few sources or its camera has moved.
+    fn sweep(&mut self, view: &SparseView) {
+        let id = view.keyframe_id;
+        let neighbours: Vec<u32> = view
+            .neighbours
+            .iter()
+            .map(|n| n.keyframe_id)
+            .filter(|n| self.state.holds(*n))
+            .collect();
+        let n_sources = neighbours.len().min(self.params.source_views);
+        let is_current = self.state.n_sources(id) >= n_sources
+            && self
+                .state
+                .drift_px(id)
+                .is_none_or(|drift| drift <= MAX_DRIFT_PX);
+        let cam_from_submap = view.submap_from_cam.inverse();
+        let depths: Vec<f64> = view
+            .landmarks
+            .iter()
+            .map(|l| cam_from_submap.transform_point(l.point_in_submap).z)
+            .collect();
+        let Some((near, far)) = depth_range(&depths).filter(|_| !is_current && n_sources > 0)
+        else {
+            return;
+        };
+        self.state.resweep(id, near, far, &neighbours);
+    }
+
+    fn view(&self, view: &SparseView) -> View {
+        let depth = self.state.depth_of(view.keyframe_id);
+        registered(view, depth.unwrap_or_else(DepthMap::none))
+    }
+}
+
+fn reported(sparse: &SparseBatch, views: Vec<View>) -> GeometryBatch {
+    GeometryBatch {
+        pose_error: PoseStd::default(),
+        batch_id: sparse.batch_id,
+        views,
+        revised: sparse.revised.clone(),
+        is_loop: sparse.is_loop,
+        observations: sparse.views.iter().map(observations).collect(),
+        note: sparse.note.clone(),
+    }
+}
+
+/// Its landmarks stay where they are before the camera.
+fn move_to(view: &mut SparseView, revision: &PoseUpdate) {
+    let old = view.submap_from_cam.inverse();
+    for landmark in &mut view.landmarks {
+        let in_cam = old.transform_point(landmark.point_in_submap) * revision.depth_factor;
+        landmark.point_in_submap = revision.submap_from_cam.transform_point(in_cam);
+    }
+    view.submap = revision.submap;
+    view.intrinsics = revision.intrinsics;
+    view.submap_from_cam = revision.submap_from_cam;
+}
+
+fn registered(view: &SparseView, depth: DepthMap) -> View {
+    View {
+        keyframe_id: view.keyframe_id,
+        submap: view.submap,
+        intrinsics: view.intrinsics,
+        lens: view.lens,
+        submap_from_cam: view.submap_from_cam,
+        depth,
+        health: view.health,
+    }
+}
+
+/// The image as the view's pinhole sees it.
+fn undistorted(image: Arc<RgbImage>, view: &SparseView) -> Option<Arc<RgbImage>> {
+    let Some(lens) = &view.lens else {
+        return Some(image);
+    };
+    let rectifier = Undistorter::onto(&view.intrinsics, lens)?;
+    Some(Arc::new(rectifier.rectify((*image).clone())))
+}
+
+fn observations(view: &SparseView) -> Observations {
+    let landmarks = view.landmarks.iter();
+    Observations {
+        keyframe_id: view.keyframe_id,
+        landmarks: landmarks
+            .map(|l| (l.landmark, l.pixel.as_vec2().to_array()))
+            .collect(),
+    }
+}

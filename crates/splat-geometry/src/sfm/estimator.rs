@@ -1,0 +1,347 @@
+//! The embedded geometry model: batches of keyframes -> poses and landmarks, then depth by stereo.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::answer::GeometryBatch;
+use crate::error::GeometryError;
+use crate::features::descriptor::{Features, working_image, working_size};
+use crate::features::extractor::FeatureExtractor;
+use crate::matching::PreparedDescriptors;
+use crate::model::GeometryModel;
+use crate::mvs::params::MvsParams;
+use crate::sfm::adjust::adjust_global;
+use crate::sfm::calibrate::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
+use crate::sfm::close_loops::{release_waiting, settle};
+use crate::sfm::dense_depth::Densifier;
+use crate::sfm::initialize::{Start, start};
+use crate::sfm::limits::Limits;
+use crate::sfm::merge_submaps::merge;
+use crate::sfm::pairwise::{link_alike, link_anew, link_newest};
+use crate::sfm::params::SfmParams;
+use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView};
+use crate::sfm::register::grow;
+use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
+use crate::sfm::updates::{Reported, SparseBatch, note};
+use splat_types::camera::Intrinsics;
+use splat_types::frame::{Batch, Keyframe};
+
+/// Size of the image that `sfm.max_error_px` is meant for.
+const ERROR_SIDE_PX: f64 = 640.0;
+/// Keyframes that a submap beside the first one needs; less is likelier a mistake than a place.
+const MIN_NEW_SUBMAP: usize = 4;
+/// Waiting keyframes that are tried with every batch, the newest; all others once more at the end.
+const MAX_WAITING: usize = 64;
+/// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
+const MAX_IMAGES: usize = 128;
+/// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
+const FIRST_FOCAL: f64 = 0.9;
+
+/// The embedded geometry model.
+#[derive(Debug)]
+pub struct Sfm {
+    sfm: SfmParams,
+    finder: FeatureExtractor,
+    pub(crate) densifier: Densifier,
+    seed: u64,
+    pub(crate) scene: Reconstruction,
+    pub(crate) reported: Reported,
+    pub(crate) batch_id: u32,
+    last_start: Option<Start>,
+    /// A loop was closed since the last report.
+    is_loop: bool,
+}
+
+impl Sfm {
+    /// An error where the parameters insist on a GPU or a network that is not there.
+    pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
+        Ok(Self {
+            sfm: sfm.clone(),
+            finder: FeatureExtractor::new(&sfm.features())?,
+            densifier: Densifier::new(mvs)?,
+            seed,
+            scene: Reconstruction::default(),
+            reported: Reported::default(),
+            batch_id: 0,
+            last_start: None,
+            is_loop: false,
+        })
+    }
+
+    /// Takes a batch; keyframes seen before are only reported again.
+    pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
+        self.batch_id = batch.id;
+        let limits = self.take_in(&batch.keyframes);
+        let waiting = self.waiting();
+        let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
+        self.place_waiting(newest, &limits, MIN_NEW_SUBMAP);
+        self.adjust_grown(&limits);
+        let shared = self.shared_views(batch);
+        self.report(&shared)
+    }
+
+    /// Last chance for what waits, then all is adjusted together.
+    pub fn finish_sparse(&mut self) -> SparseBatch {
+        let keyframes: Vec<Arc<Keyframe>> = self
+            .scene
+            .views
+            .iter()
+            .map(|s| Arc::clone(&s.keyframe))
+            .collect();
+        let limits = self.limits(&keyframes);
+        let waiting = self.waiting();
+        for &view in &waiting {
+            self.scene.views[view].failed_with = 0;
+            link_alike(&mut self.scene, view, limits.max_error_px, self.seed);
+        }
+        self.place_waiting(&waiting, &limits, 3);
+        for submap in 0..self.scene.submaps.len() as u32 {
+            adjust_global(&mut self.scene, submap, limits.max_error_px, 30);
+        }
+        self.report(&[])
+    }
+
+    fn report(&mut self, again: &[usize]) -> SparseBatch {
+        let all: Vec<usize>;
+        let again = if undistort_images(&mut self.scene) {
+            all = (0..self.scene.views.len()).collect();
+            &all
+        } else {
+            again
+        };
+        let mut out = self.reported.changes(&self.scene, again);
+        out.batch_id = self.batch_id;
+        out.is_loop = std::mem::take(&mut self.is_loop);
+        out.note = note(&self.scene, self.last_start);
+        out
+    }
+
+    /// Makes views of the keyframes that are new, and links them to those before.
+    pub(crate) fn take_in(&mut self, keyframes: &[Arc<Keyframe>]) -> Limits {
+        let limits = self.limits(keyframes);
+        let fresh: Vec<&Arc<Keyframe>> = keyframes
+            .iter()
+            .filter(|k| self.view_of(k.id).is_none())
+            .collect();
+        let looked = |keyframe: &&Arc<Keyframe>| {
+            let image = working_image(&keyframe.frame.image, self.sfm.max_side);
+            (
+                self.finder.features(&image, self.sfm.max_features),
+                (image.width as u32, image.height as u32),
+            )
+        };
+        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
+        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
+            self.push(keyframe, features, size);
+            link_newest(&mut self.scene, limits.max_error_px, self.seed);
+        }
+        self.let_go();
+        limits
+    }
+
+    /// Images that stereo has no use for any more leave memory; features and sizes stay.
+    fn let_go(&mut self) {
+        let n = self.scene.views.len();
+        for (ix, view) in self.scene.views.iter_mut().enumerate() {
+            let is_old = view.registered.is_some() && ix + MAX_IMAGES < n;
+            let is_hopeless = ix + 2 * MAX_IMAGES < n;
+            if (is_old || is_hopeless) && !view.keyframe.frame.image.is_unloaded() {
+                view.keyframe = Arc::new(view.keyframe.unloaded());
+            }
+        }
+    }
+
+    /// Views of the keyframes that the batch before had, too.
+    pub(crate) fn shared_views(&self, batch: &Batch) -> Vec<usize> {
+        let shared = batch.keyframes.iter().take(batch.n_shared);
+        shared.filter_map(|k| self.view_of(k.id)).collect()
+    }
+
+    fn limits(&self, keyframes: &[Arc<Keyframe>]) -> Limits {
+        let longest = keyframes.iter().map(|k| {
+            let (w, h) = working_size(
+                k.frame.image.width_px,
+                k.frame.image.height_px,
+                self.sfm.max_side,
+            );
+            w.max(h)
+        });
+        let side = f64::from(longest.max().unwrap_or(self.sfm.max_side));
+        Limits {
+            max_error_px: self.sfm.max_error_px * side / ERROR_SIDE_PX,
+            min_inliers: self.sfm.min_inliers,
+            min_parallax_deg: self.sfm.min_parallax_deg,
+            local_ba_prior: self.sfm.local_ba_prior,
+            seed: self.seed,
+        }
+    }
+
+    fn view_of(&self, keyframe_id: u32) -> Option<usize> {
+        // The newest are asked for most.
+        self.scene
+            .views
+            .iter()
+            .rposition(|s| s.keyframe.id == keyframe_id)
+    }
+
+    /// Adds a view whose features are given in a working image of that size.
+    fn push(&mut self, keyframe: &Arc<Keyframe>, found: Features, (w, h): (u32, u32)) {
+        let image = &keyframe.frame.image;
+        let known = keyframe.frame.intrinsics.filter(Intrinsics::is_plausible);
+        let lens = known
+            .unwrap_or_else(|| self.guessed_lens(image.width_px, image.height_px))
+            .resized(w, h);
+        let distorted_pixels = match known {
+            Some(_) => Vec::new(),
+            None => found.pixels.clone(),
+        };
+        let mut view = SfmView {
+            keyframe: Arc::clone(keyframe),
+            distorted_pixels,
+            signature: PreparedDescriptors::new(&found.signature()),
+            lens,
+            is_calibrated: known.is_some(),
+            registered: None,
+            landmark_of: vec![NONE; found.len()],
+            matched: vec![Vec::new(); found.len()],
+            failed_with: 0,
+            features: found,
+        };
+        view.undistort(self.scene.radial);
+        self.scene.views.push(view);
+    }
+
+    fn guessed_lens(&self, width_px: u32, height_px: u32) -> Intrinsics {
+        let (w, h) = (f64::from(width_px), f64::from(height_px));
+        let guess = if self.sfm.focal_guess > 0.0 {
+            self.sfm.focal_guess
+        } else {
+            FIRST_FOCAL * w.max(h)
+        };
+        let f = current_share(&self.scene).map_or(guess, |share| share * w.max(h));
+        Intrinsics {
+            width_px,
+            height_px,
+            fx: f,
+            fy: f,
+            cx: 0.5 * w,
+            cy: 0.5 * h,
+        }
+    }
+
+    /// Starts a submap of the waiting views, if there are enough of them.
+    fn try_start(&mut self, pool: &[usize], min_views: usize, limits: &Limits) -> Option<Start> {
+        let is_first = self.scene.submaps.is_empty();
+        let waiting = pool
+            .iter()
+            .filter(|&&s| self.scene.views[s].registered.is_none());
+        let n_uncalibrated = waiting
+            .clone()
+            .filter(|&&s| !self.scene.views[s].is_calibrated)
+            .count();
+        let n_waiting = waiting.count();
+        let needed = if is_first {
+            pool.len().min(3)
+        } else {
+            min_views
+        };
+        if n_waiting < needed.max(2) {
+            return None;
+        }
+        if !is_first || n_uncalibrated == 0 {
+            return Some(start(&mut self.scene, pool, needed, limits));
+        }
+        let is_last_chance = min_views < MIN_NEW_SUBMAP;
+        if n_waiting < MIN_UNCALIBRATED && !is_last_chance {
+            return None;
+        }
+        let guess = (self.sfm.focal_guess > 0.0)
+            .then(|| current_share(&self.scene))
+            .flatten();
+        Some(start_uncalibrated(&mut self.scene, pool, guess, limits))
+    }
+
+    fn waiting(&self) -> Vec<usize> {
+        (0..self.scene.views.len())
+            .filter(|&s| self.scene.views[s].registered.is_none())
+            .collect()
+    }
+
+    fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_views: usize) {
+        grow(&mut self.scene, pool, limits);
+        release_waiting(&mut self.scene);
+        grow(&mut self.scene, pool, limits);
+        while let Some(outcome) = self.try_start(pool, min_views, limits) {
+            self.last_start = Some(outcome);
+            if outcome != Start::Started {
+                break;
+            }
+        }
+        if links_are_stale(&mut self.scene, limits.max_error_px) {
+            link_anew(&mut self.scene, limits.max_error_px, self.seed);
+            for submap in 0..self.scene.submaps.len() as u32 {
+                adjust_global(&mut self.scene, submap, limits.max_error_px, 15);
+            }
+            grow(&mut self.scene, pool, limits);
+        }
+        let max_loop_correction = self.sfm.loops.then_some(self.sfm.max_loop_correction);
+        self.is_loop |= settle(&mut self.scene, limits, max_loop_correction);
+        while merge(&mut self.scene, limits) {
+            grow(&mut self.scene, pool, limits);
+        }
+    }
+
+    /// All views of a submap together, when it grew enough to be worth it.
+    fn adjust_grown(&mut self, limits: &Limits) {
+        for submap in 0..self.scene.submaps.len() as u32 {
+            let size = &self.scene.submaps[submap as usize];
+            if size.views.len() as f64 >= 1.1 * size.n_adjusted as f64 {
+                adjust_global(&mut self.scene, submap, limits.max_error_px, 8);
+            }
+        }
+    }
+
+    pub(crate) fn densify(&mut self, sparse: &SparseBatch) -> GeometryBatch {
+        let scene = &self.scene;
+        self.densifier.densify(sparse, &|id| scene.image_of(id))
+    }
+}
+
+impl GeometryModel for Sfm {
+    fn accepts_small_batches(&self) -> bool {
+        true
+    }
+
+    fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
+        let sparse = self.sparse(batch);
+        Ok(self.densify(&sparse))
+    }
+
+    fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
+        let sparse = self.sparse(batch);
+        let scene = &self.scene;
+        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+    }
+
+    fn depth(&mut self) -> Option<GeometryBatch> {
+        let view = self.densifier.next()?;
+        Some(GeometryBatch {
+            batch_id: self.batch_id,
+            views: vec![view],
+            ..GeometryBatch::default()
+        })
+    }
+
+    fn pending_depths(&self) -> usize {
+        self.densifier.n_waiting()
+    }
+
+    fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
+        let sparse = self.finish_sparse();
+        Ok(self.densify(&sparse))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,35 @@
+//! Keyframes -> poses, intrinsics and landmarks, one submap per connected part.
+
+pub mod params;
+
+mod limits;
+
+mod undistorted;
+
+mod reconstruction;
+
+mod landmarks;
+
+mod adjust;
+
+mod pairwise;
+
+mod merge_submaps;
+
+mod close_loops;
+
+mod register;
+
+mod initialize;
+
+mod calibrate;
+
+pub mod updates;
+
+mod dense_depth;
+
+mod undistorted_views;
+
+pub mod estimator;
+
+pub mod known_poses;

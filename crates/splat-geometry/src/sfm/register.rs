@@ -1,0 +1,126 @@
+//! Waiting views -> poses in a submap, best supported first; each one brings landmarks and a local adjustment.
+
+use glam::{DVec2, DVec3};
+
+use crate::pnp;
+use crate::sfm::adjust::{adjust_global, adjust_local};
+use crate::sfm::landmarks::extend;
+use crate::sfm::limits::Limits;
+use crate::sfm::pairwise::pair_seed;
+use crate::sfm::reconstruction::{NONE, Reconstruction};
+
+/// Share of the candidate landmarks that must agree with a pose.
+const MIN_SHARE: f64 = 0.25;
+/// Growth of a submap after which all its views are adjusted together.
+const GLOBAL_GROWTH: f64 = 1.3;
+/// A view whose landmarks all lie in a smaller part of the image (standard deviation as a share of the longer
+/// side) could slide or turn freely.
+const MIN_SPREAD: f64 = 0.03;
+
+/// Places as many of the waiting views of `pool` as can be registered.
+pub(crate) fn grow(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
+    while let Some((view, submap, pairs)) = best_waiting(scene, pool, limits) {
+        let Some(cam_from_world) = pose(scene, view, &pairs, limits) else {
+            scene.views[view].failed_with = pairs.len();
+            continue;
+        };
+        scene.place(view, submap, cam_from_world);
+        extend(scene, view, limits.max_error_px);
+        adjust_local(scene, view, limits);
+        // Landmarks that the adjustment threw out again spoke for a wrong pose.
+        let n_left = scene.views[view]
+            .landmark_of
+            .iter()
+            .filter(|l| **l != NONE)
+            .count();
+        if 3 * n_left < 2 * limits.min_inliers {
+            scene.unplace(view);
+            scene.views[view].failed_with = pairs.len();
+            continue;
+        }
+        let size = &scene.submaps[submap as usize];
+        if size.views.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 {
+            adjust_global(scene, submap, limits.max_error_px, 8);
+        }
+    }
+}
+
+/// Features of a view whose matches have landmarks in a submap: (feature, landmark), the most named one each.
+pub(crate) fn correspondences(
+    scene: &Reconstruction,
+    view_ix: usize,
+    submap: u32,
+) -> Vec<(u32, u32)> {
+    let mut pairs = Vec::new();
+    for (feature, matched) in scene.views[view_ix].matched.iter().enumerate() {
+        let owners = matched
+            .iter()
+            .map(|&(s, f)| scene.views[s as usize].landmark_of[f as usize]);
+        let mut named: Vec<u32> = owners.filter(|&l| l != NONE).collect();
+        named.retain(|&l| scene.landmarks[l as usize].submap == submap);
+        named.sort_unstable();
+        let count = |l: &u32| named.iter().filter(|n| *n == l).count();
+        if let Some(best) = named.iter().rev().max_by_key(|l| count(l)) {
+            pairs.push((feature as u32, *best));
+        }
+    }
+    pairs
+}
+
+type Waiting = (usize, u32, Vec<(u32, u32)>);
+
+/// The waiting view with most landmarks in one submap; one that failed needs a fifth more than then.
+fn best_waiting(scene: &Reconstruction, pool: &[usize], limits: &Limits) -> Option<Waiting> {
+    let mut best: Option<Waiting> = None;
+    for &view in pool
+        .iter()
+        .filter(|&&s| scene.views[s].registered.is_none())
+    {
+        for submap in 0..scene.submaps.len() as u32 {
+            let pairs = correspondences(scene, view, submap);
+            let needed = limits
+                .min_inliers
+                .max(scene.views[view].failed_with * 6 / 5 + 1);
+            let is_better = best.as_ref().is_none_or(|b| pairs.len() > b.2.len());
+            if pairs.len() >= needed && is_better {
+                best = Some((view, submap, pairs));
+            }
+        }
+    }
+    best
+}
+
+fn pose(
+    scene: &Reconstruction,
+    view_ix: usize,
+    pairs: &[(u32, u32)],
+    limits: &Limits,
+) -> Option<splat_types::transform::Rigid> {
+    let view = &scene.views[view_ix];
+    let points: Vec<DVec3> = pairs
+        .iter()
+        .map(|p| scene.landmarks[p.1 as usize].point)
+        .collect();
+    let pixels: Vec<DVec2> = pairs
+        .iter()
+        .map(|p| view.features.pixels[p.0 as usize])
+        .collect();
+    let seed = pair_seed(limits.seed, view_ix, pairs.len());
+    let found = pnp::place(
+        &points,
+        &pixels,
+        &view.lens,
+        (1.5 * limits.max_error_px, limits.min_inliers),
+        seed,
+    )?;
+    let share = found.inliers.len() as f64 / pairs.len() as f64;
+    let picked: Vec<DVec2> = found.inliers.iter().map(|&i| pixels[i]).collect();
+    let longest = f64::from(view.lens.width_px.max(view.lens.height_px));
+    (share >= MIN_SHARE && spread(&picked) >= MIN_SPREAD * longest).then_some(found.cam_from_world)
+}
+
+fn spread(pixels: &[DVec2]) -> f64 {
+    let n = pixels.len().max(1) as f64;
+    let mean = pixels.iter().sum::<DVec2>() / n;
+    (pixels.iter().map(|p| p.distance_squared(mean)).sum::<f64>() / n).sqrt()
+}

@@ -1,0 +1,39 @@
+//! One value that a thread replaces and others read: the newest counts, older ones are gone.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Readers get the newest value; nobody waits for another.
+#[derive(Debug, Default)]
+pub struct Latest<T> {
+    value: Mutex<Arc<T>>,
+}
+
+impl<T> Latest<T> {
+    pub fn new(value: T) -> Self {
+        Self {
+            value: Mutex::new(Arc::new(value)),
+        }
+    }
+
+    pub fn get(&self) -> Arc<T> {
+        // The value is exchanged whole: a panic leaves the old one.
+        Arc::clone(&self.value.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    pub fn set(&self, value: T) {
+        *self.value.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(value);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn readers_get_the_newest_value_and_keep_the_one_they_have() {
+        let cell = Latest::new(1);
+        let first = cell.get();
+        cell.set(2);
+        assert_eq!((*first, *cell.get()), (1, 2));
+    }
+}

@@ -1,0 +1,268 @@
+//! MCAP recordings of ROS 2 topics -> frames.
+//!
+//! Surveys the recording once for its topics, calibration and ground truth, then replays the images.
+
+use std::collections::VecDeque;
+use std::path::Path;
+
+use crate::bag::{Bag, files_of, not_mcap};
+use crate::camera_info;
+use crate::error::SourceError;
+use crate::frame_source::{Source, SourceCounts};
+use crate::ground_truth::{GroundTruth, Odometry, half_interval};
+use crate::intake::{Arrival, Extras, Intake};
+use crate::params::SourceParams;
+use crate::survey::{Survey, header_stamp};
+use crate::topics::{depth_topic_of, image_topic_of, lens_of, odometry_of, truth_of};
+use splat_image::jpeg::decoder::Jpeg;
+use splat_msgs::ros::{self, CompressedImage, Image};
+use splat_types::depth::DepthMap;
+use splat_types::frame::Frame;
+use splat_types::image::RgbImage;
+use splat_types::time::Stamp;
+
+/// Images, and depth maps, that wait for each other: their messages may lie so far apart in the recording.
+const MAX_AHEAD: usize = 32;
+/// Memory for either.
+const MAX_AHEAD_BYTES: usize = 64 << 20;
+
+/// A message that waits; the stamp is `None` where not even that can be read.
+#[derive(Debug)]
+struct Waiting {
+    stamp: Option<Stamp>,
+    payload: Vec<u8>,
+}
+
+#[derive(Debug)]
+pub struct McapSource {
+    bag: Bag,
+    image_topic: String,
+    is_compressed: bool,
+    depth_topic: Option<String>,
+    truth: GroundTruth,
+    odometry: Odometry,
+    truth_within_nanos: i64,
+    n_images: u64,
+    max_frames: u64,
+    images: VecDeque<Waiting>,
+    depths: VecDeque<Waiting>,
+    is_read: bool,
+    jpeg: Jpeg,
+    intake: Intake,
+}
+
+impl McapSource {
+    /// `path` is a `.mcap` file, or a rosbag2 folder whose files are read in the order of its metadata.yaml.
+    pub fn open(path: &Path, params: &SourceParams) -> Result<Self, SourceError> {
+        let files = files_of(path)?;
+        if let Some(reason) = files.first().and_then(|first| not_mcap(first)) {
+            let way_out = "record with ros2 bag record -s mcap, or convert with mcap convert";
+            return Err(SourceError::Open {
+                what: "recording",
+                reason,
+                way_out,
+                path: path.to_owned(),
+            });
+        }
+        let mut survey = Survey::of(files.clone());
+        let image_topic = image_topic_of(&survey, params, path)?;
+        let topic = &survey.topics[&image_topic];
+        if survey.has_left_out {
+            tracing::warn!(
+                "more poses than are kept: frames late in the recording have no ground truth"
+            );
+        }
+        let depth_topic = depth_topic_of(&survey, params);
+        let lens = match camera_info::of_url(&params.camera_info_url)? {
+            Some((_, lens)) => Some(lens),
+            None => lens_of(&survey, &image_topic, params),
+        };
+        let (is_compressed, n_images) = (topic.is_compressed(), topic.n_messages);
+        let truth_within_nanos = half_interval(&topic.stamps);
+        tracing::info!(
+            topic = image_topic,
+            frames = n_images,
+            calibrated = lens.is_some(),
+            "recording opened"
+        );
+        Ok(Self {
+            bag: Bag::new(files),
+            is_compressed,
+            depth_topic,
+            truth_within_nanos,
+            n_images,
+            odometry: odometry_of(&mut survey, &image_topic, params),
+            truth: truth_of(survey, &image_topic, params),
+            image_topic,
+            max_frames: params.max_frames,
+            images: VecDeque::new(),
+            depths: VecDeque::new(),
+            is_read: false,
+            jpeg: Jpeg::default(),
+            intake: Intake::new(params, lens),
+        })
+    }
+
+    /// Takes one message in.
+    fn read_on(&mut self) {
+        let message = match self.bag.next_message() {
+            Ok(Some(message)) => message,
+            Ok(None) => {
+                self.is_read = true;
+                return;
+            }
+            Err(fault) => {
+                self.is_read = true;
+                self.intake.fault(fault);
+                return;
+            }
+        };
+        let waiting = if message.channel.topic == self.image_topic {
+            &mut self.images
+        } else if Some(&message.channel.topic) == self.depth_topic.as_ref() {
+            &mut self.depths
+        } else {
+            return;
+        };
+        let stamp = header_stamp(message.payload, message.log_nanos);
+        waiting.push_back(Waiting {
+            stamp,
+            payload: message.payload.to_vec(),
+        });
+        while self.depths.len() > MAX_AHEAD
+            || (self.depths.len() > 1 && bytes_of(&self.depths) > MAX_AHEAD_BYTES)
+        {
+            self.depths.pop_front();
+        }
+    }
+
+    /// The oldest image, once its depth map is here or will not come.
+    fn take_ready(&mut self) -> Option<Waiting> {
+        let stamp = self.images.front()?.stamp;
+        let newest_depth = self.depths.iter().filter_map(|depth| depth.stamp).max();
+        let is_ready = self.is_read
+            || self.depth_topic.is_none()
+            || stamp.is_none()
+            || newest_depth >= stamp
+            || self.images.len() > MAX_AHEAD
+            || bytes_of(&self.images) > MAX_AHEAD_BYTES;
+        if is_ready {
+            self.images.pop_front()
+        } else {
+            None
+        }
+    }
+
+    fn frame_of(&mut self, waiting: &Waiting) -> Option<Frame> {
+        let Some(stamp) = waiting.stamp else {
+            self.intake.unreadable("its message has no CDR header");
+            return None;
+        };
+        let arrival = self.intake.arrive(stamp)?;
+        let mut image = self.intake.spare();
+        let jpeg = &mut self.jpeg;
+        match decode_into(&waiting.payload, self.is_compressed, jpeg, &mut image) {
+            Ok(()) => self.frame_with(arrival, image),
+            Err(reason) => {
+                self.intake.undecodable(arrival.seq, &reason);
+                None
+            }
+        }
+    }
+
+    fn frame_with(&mut self, arrival: Arrival, image: RgbImage) -> Option<Frame> {
+        let truth = self.truth.at(arrival.stamp, self.truth_within_nanos);
+        let depth = self
+            .depths
+            .iter()
+            .find(|depth| depth.stamp == Some(arrival.stamp));
+        let sensor_depth = match depth.map(|depth| depth_of(&depth.payload)) {
+            Some(Ok(depth)) => Some(depth),
+            Some(Err(reason)) => {
+                self.intake
+                    .warn_once("depth", &format!("depth maps are left out: {reason}"));
+                None
+            }
+            None => None,
+        };
+        self.intake.frame(
+            arrival,
+            image,
+            Extras {
+                truth,
+                odometry: self.odometry.at(arrival.stamp),
+                sensor_depth,
+                ..Extras::default()
+            },
+        )
+    }
+}
+
+impl Source for McapSource {
+    fn next(&mut self) -> Option<Frame> {
+        while !self.intake.is_full() {
+            if let Some(waiting) = self.take_ready() {
+                if let Some(frame) = self.frame_of(&waiting) {
+                    return Some(frame);
+                }
+            } else if self.is_read {
+                return None;
+            } else {
+                self.read_on();
+            }
+        }
+        None
+    }
+
+    fn counts(&self) -> SourceCounts {
+        self.intake.counts()
+    }
+
+    fn len_hint(&self) -> Option<u64> {
+        let counts = self.intake.counts();
+        let left = self.n_images.saturating_sub(counts.received);
+        let frames_out = counts.received - counts.undecodable - counts.out_of_order;
+        let room = if self.max_frames == 0 {
+            u64::MAX
+        } else {
+            self.max_frames.saturating_sub(frames_out)
+        };
+        Some(left.min(room))
+    }
+
+    fn truth_extent(&self) -> Option<f64> {
+        self.truth.extent()
+    }
+}
+
+fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
+    queue.iter().map(|waiting| waiting.payload.len()).sum()
+}
+
+/// For sources whose images come as messages, too.
+#[cfg(feature = "ros2")]
+pub fn image_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
+    let mut out = splat_image::limits::empty();
+    decode_into(payload, is_compressed, &mut Jpeg::default(), &mut out)?;
+    Ok(out)
+}
+
+fn decode_into(
+    payload: &[u8],
+    is_compressed: bool,
+    jpeg: &mut Jpeg,
+    out: &mut RgbImage,
+) -> Result<(), String> {
+    if is_compressed {
+        let message: CompressedImage = ros::decode(payload).map_err(|e| e.to_string())?;
+        return splat_image::codec::compressed_into(&message.data, jpeg, out)
+            .map_err(|e| e.to_string());
+    }
+    let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
+    crate::ros_image::raw_into(&message, out).map_err(|e| e.to_string())
+}
+
+pub fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
+    let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
+    crate::ros_image::depth(&message).map_err(|e| e.to_string())
+}

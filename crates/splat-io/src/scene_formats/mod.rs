@@ -1,0 +1,13 @@
+//! Scenes of other programs: COLMAP, transforms.json.
+
+mod binary;
+
+mod listed;
+
+mod colmap;
+
+mod image_files;
+
+mod transforms;
+
+pub mod scene;

@@ -1,0 +1,222 @@
+//! Survey of a recording -> which of its topics are the image, the calibration, the depth and the ground truth.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::calibration::lens_of_camera_info;
+use crate::error::SourceError;
+use crate::ground_truth::{GroundTruth, Odometry};
+use crate::params::SourceParams;
+use crate::survey::{Survey, Topic};
+use splat_msgs::ros::CameraInfo;
+use splat_types::camera::CameraModel;
+use splat_types::transform::Rigid;
+
+pub(crate) fn image_topic_of(
+    survey: &Survey,
+    params: &SourceParams,
+    path: &Path,
+) -> Result<String, SourceError> {
+    let none = || SourceError::NoImageTopic {
+        found: survey.listing(),
+        path: path.to_owned(),
+    };
+    if !params.image_topic.is_empty() {
+        let topic = survey.topics.get(&params.image_topic).ok_or_else(none)?;
+        if topic.is_image() {
+            return Ok(params.image_topic.clone());
+        }
+        let found = format!("{} ({})", topic.type_name, topic.message_encoding);
+        return Err(SourceError::TopicType {
+            topic: params.image_topic.clone(),
+            found,
+            path: path.to_owned(),
+        });
+    }
+    let candidates = || {
+        survey
+            .topics
+            .iter()
+            .filter(|(name, topic)| is_candidate(name, topic, params))
+            .map(|(name, _)| name)
+    };
+    let calibrated = candidates().find(|name| survey.infos.contains_key(&info_beside(name)));
+    calibrated
+        .or_else(|| candidates().next())
+        .cloned()
+        .ok_or_else(none)
+}
+
+fn is_candidate(name: &str, topic: &Topic, params: &SourceParams) -> bool {
+    topic.is_image()
+        && !topic.is_depth()
+        && !name.ends_with("/compressedDepth")
+        && name != params.depth_topic
+}
+
+/// `/camera/image_raw/compressed` and `/camera/image_raw` have `/camera/camera_info` beside them.
+pub fn info_beside(image_topic: &str) -> String {
+    let base = image_topic
+        .strip_suffix("/compressed")
+        .unwrap_or(image_topic);
+    format!(
+        "{}/camera_info",
+        base.rsplit_once('/').map_or("", |(parent, _)| parent)
+    )
+}
+
+pub(crate) fn depth_topic_of(survey: &Survey, params: &SourceParams) -> Option<String> {
+    if params.depth_topic.is_empty() {
+        return survey
+            .topics
+            .iter()
+            .find(|(_, topic)| topic.is_image() && topic.is_depth())
+            .map(|(name, _)| name.clone());
+    }
+    if !survey.topics.contains_key(&params.depth_topic) {
+        tracing::warn!(
+            "no messages on depth topic {:?}; found {}",
+            params.depth_topic,
+            survey.listing()
+        );
+    }
+    Some(params.depth_topic.clone())
+}
+
+pub(crate) fn lens_of(
+    survey: &Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> Option<CameraModel> {
+    let topic = if !params.camera_info_topic.is_empty() {
+        params.camera_info_topic.clone()
+    } else {
+        let beside = info_beside(image_topic);
+        let n_cameras = survey
+            .topics
+            .iter()
+            .filter(|(name, topic)| is_candidate(name, topic, params))
+            .count();
+        let only = (survey.infos.len() == 1 && n_cameras == 1)
+            .then(|| survey.infos.keys().next().cloned());
+        if survey.infos.contains_key(&beside) {
+            beside
+        } else {
+            only.flatten().unwrap_or(beside)
+        }
+    };
+    let Some(info) = survey.infos.get(&topic) else {
+        tracing::warn!("no CameraInfo on {topic:?}: the camera counts as uncalibrated");
+        return None;
+    };
+    let found = lens_of_camera_info(info, is_rectified(image_topic, info));
+    found
+        .inspect_err(|found| {
+            tracing::warn!("camera counts as uncalibrated, {topic:?} says: {found}");
+        })
+        .ok()
+}
+
+/// image_proc publishes undistorted images as `image_rect` and `image_rect_color` beside the CameraInfo of the raw ones.
+pub fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
+    let base = image_topic
+        .strip_suffix("/compressed")
+        .unwrap_or(image_topic);
+    base.rsplit('/')
+        .next()
+        .is_some_and(|name| name.starts_with("image_rect"))
+        && info.p[0] > 0.0
+}
+
+pub(crate) fn odometry_of(
+    survey: &mut Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> Odometry {
+    let wanted = &params.odometry_topic;
+    let name = if wanted.is_empty() {
+        survey.odometry.keys().next().cloned()
+    } else {
+        Some(wanted.clone())
+    };
+    let camera_frame = survey
+        .topics
+        .get(image_topic)
+        .map(|topic| topic.frame_id.clone())
+        .unwrap_or_default();
+    if let Some((base, track)) = name.and_then(|name| survey.odometry.remove(&name)) {
+        let mounted = survey.transforms.fixed(&base, &camera_frame);
+        if mounted.is_none() {
+            tracing::warn!(
+                "no fixed transforms from {base:?} to the camera {camera_frame:?}: it counts as mounted where odometry turns"
+            );
+        }
+        return Odometry::Messages {
+            track,
+            base_from_cam: mounted.unwrap_or(Rigid::IDENTITY),
+        };
+    }
+    if !wanted.is_empty() {
+        let listing = survey.listing();
+        tracing::warn!("no odometry on topic {wanted:?}; found {listing}");
+    } else if survey.transforms.reaches_odometry(&camera_frame) {
+        return Odometry::Transforms {
+            transforms: Arc::clone(&survey.transforms),
+            camera_frame,
+        };
+    }
+    Odometry::None
+}
+
+pub(crate) fn truth_of(
+    mut survey: Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> GroundTruth {
+    if !params.pose_topic.is_empty() {
+        return match survey.poses.remove(&params.pose_topic) {
+            Some(track) => GroundTruth::Track(track),
+            None => {
+                tracing::warn!(
+                    "no poses on topic {:?}; found {}",
+                    params.pose_topic,
+                    survey.listing()
+                );
+                GroundTruth::None
+            }
+        };
+    }
+    // A goal that someone clicked is a PoseStamped too.
+    let named = |words: &[&str]| {
+        survey
+            .poses
+            .keys()
+            .find(|name| words.iter().any(|word| name.contains(word)))
+            .cloned()
+    };
+    let other = || {
+        survey
+            .poses
+            .keys()
+            .find(|name| !name.contains("goal"))
+            .cloned()
+    };
+    if let Some(track) = named(&["truth", "/gt"])
+        .or_else(other)
+        .and_then(|name| survey.poses.remove(&name))
+    {
+        return GroundTruth::Track(track);
+    }
+    let camera_frame = survey
+        .topics
+        .get(image_topic)
+        .map(|topic| topic.frame_id.clone())
+        .unwrap_or_default();
+    if survey.transforms.reaches_world(&camera_frame) {
+        return GroundTruth::Transforms {
+            transforms: survey.transforms,
+            camera_frame,
+        };
+    }
+    GroundTruth::None
+}

@@ -1,0 +1,36 @@
+//! A map and its poses -> messages over zenoh, MCAP and ROS 2; services answered.
+
+pub mod error;
+
+pub mod transport;
+
+pub mod latched;
+
+pub mod map_stream;
+
+pub mod params;
+
+pub mod navigation;
+
+mod mcap_transport;
+
+pub mod slew;
+
+pub mod status;
+
+pub mod odometry;
+
+pub mod pose_messages;
+
+mod pose_stream;
+
+pub mod render_view;
+
+pub mod service_server;
+
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
+
+pub mod publisher;
+
+pub mod ros2;

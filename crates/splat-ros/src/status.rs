@@ -1,0 +1,302 @@
+//! How the mapper stands -> its status message and diagnostics.
+
+use std::collections::VecDeque;
+
+use crate::transport::{Delivery, Topic};
+use splat_io::frame_source::SourceCounts;
+use splat_msgs::ros::Header;
+use splat_msgs::ros::standard::{DiagnosticArray, DiagnosticStatus, KeyValue};
+use splat_msgs::status_message::MapperStatus;
+use splat_types::snapshot::Scale;
+use splat_types::time::Stamp;
+use splat_types::tracking::TrackState;
+
+pub static STATUS: Topic = Topic::of::<MapperStatus>("status", Delivery::Latched { depth: 1 });
+pub static DIAGNOSTICS: Topic =
+    Topic::of::<DiagnosticArray>("/diagnostics", Delivery::Reliable { depth: 10 });
+
+/// Times that a percentile is taken over.
+const MAX_TIMES: usize = 1000;
+/// Seconds without an image after which the input counts as slow, and as silent.
+const SLOW_SECS: f64 = 1.0;
+const SILENT_SECS: f64 = 3.0;
+/// STATE_RECOVERING of the message.
+const RECOVERING: u8 = 6;
+const MIB: f64 = (1 << 20) as f64;
+
+/// The last times of one kind, in seconds.
+#[derive(Debug, Clone, Default)]
+pub struct Times(VecDeque<f64>);
+
+impl Times {
+    pub fn note(&mut self, secs: f64) {
+        if self.0.len() == MAX_TIMES {
+            self.0.pop_front();
+        }
+        self.0.push_back(secs);
+    }
+
+    /// Milliseconds; NaN while there are none.
+    fn percentile_ms(&self, share: f64) -> f32 {
+        let mut sorted: Vec<f64> = self.0.iter().copied().collect();
+        sorted.sort_by(f64::total_cmp);
+        let ix = ((sorted.len() as f64 * share) as usize).min(sorted.len().saturating_sub(1));
+        sorted.get(ix).map_or(f32::NAN, |secs| (secs * 1e3) as f32)
+    }
+}
+
+/// What all stages say of themselves; each writes its own part.
+#[derive(Debug, Clone, Default)]
+pub struct Status {
+    pub map_id: [u8; 16],
+    pub epoch: u32,
+    pub revision: u32,
+    /// Of the newest frame that was looked at.
+    pub stamp: Stamp,
+    pub counts: SourceCounts,
+    pub n_dropped: u64,
+    /// `None` before the first frame.
+    pub tracked: Option<TrackState>,
+    pub reason: String,
+    pub n_tracked: u64,
+    pub n_missed: u64,
+    pub n_selected: u64,
+    pub n_registered: u64,
+    pub n_submaps: u64,
+    pub n_splats: u64,
+    pub n_steps: u64,
+    pub steps_per_s: f64,
+    pub gpu_bytes: u64,
+    pub frame_to_pose: Times,
+    pub keyframe_to_pose: Times,
+    pub queued: [u32; 3],
+    pub scale: Scale,
+    pub is_calibrated: bool,
+    pub is_paused: bool,
+    /// Why the map is being put on another engine.
+    pub recovering: Option<String>,
+    pub has_ended: bool,
+    /// What the input says of itself, for example that a camera is gone.
+    pub source_notes: Vec<String>,
+}
+
+impl Status {
+    fn state(&self) -> u8 {
+        match self.tracked {
+            _ if self.has_ended => 5,
+            _ if self.is_paused => 4,
+            _ if self.recovering.is_some() => RECOVERING,
+            None | Some(TrackState::Initialising) => 0,
+            Some(TrackState::Tracking) => 1,
+            Some(TrackState::Lost) => 2,
+            Some(TrackState::Relocalised) => 3,
+        }
+    }
+
+    /// What keeps the mapper from working well.
+    pub fn warnings(&self, silent_secs: f64) -> Vec<String> {
+        let mut warnings = self.source_notes.clone();
+        let runs = !self.has_ended && !self.is_paused;
+        if runs && silent_secs > SLOW_SECS {
+            warnings.push(if self.counts.received == 0 {
+                format!("no image has come for {silent_secs:.0} s: is the camera on, and is it this topic?")
+            } else {
+                format!("no image for {silent_secs:.0} s")
+            });
+        }
+        if let Some(fault) = &self.counts.fault {
+            warnings.push(fault.clone());
+        }
+        if self.n_registered > 0 && self.scale.metres_per_unit.is_none() {
+            warnings.push(
+                "lengths are up to scale: no odometry, depth, camera height or baseline is known"
+                    .to_owned(),
+            );
+        }
+        if self.counts.received > 0 && !self.is_calibrated {
+            warnings.push("the camera is uncalibrated: its focal length is estimated".to_owned());
+        }
+        if self.n_submaps > 1 {
+            let n = self.n_submaps;
+            warnings.push(format!("{n} parts of the input do not hang together"));
+        }
+        warnings
+    }
+
+    pub fn message(&self, frame: &str, rss_mib: Option<f64>, silent_secs: f64) -> MapperStatus {
+        let (scale_source, metres_per_unit, scale_std) = self.scale.to_numbers();
+        MapperStatus {
+            header: Header::new(self.stamp, frame),
+            map_id: self.map_id,
+            epoch: self.epoch,
+            revision: self.revision,
+            state: self.state(),
+            reason: self.recovering.as_ref().unwrap_or(&self.reason).clone(),
+            frames_received: self.counts.received,
+            frames_dropped: self.n_dropped + self.counts.dropped,
+            frames_undecodable: self.counts.undecodable,
+            frames_out_of_order: self.counts.out_of_order,
+            frames_tracked: self.n_tracked,
+            frames_lost: self.n_missed,
+            keyframes_selected: self.n_selected as u32,
+            keyframes_registered: self.n_registered as u32,
+            submaps: self.n_submaps as u32,
+            splats: self.n_splats as u32,
+            steps: self.n_steps,
+            steps_per_s: self.steps_per_s as f32,
+            frame_to_pose_p50_ms: self.frame_to_pose.percentile_ms(0.5),
+            frame_to_pose_p95_ms: self.frame_to_pose.percentile_ms(0.95),
+            keyframe_to_pose_p50_ms: self.keyframe_to_pose.percentile_ms(0.5),
+            keyframe_to_pose_p95_ms: self.keyframe_to_pose.percentile_ms(0.95),
+            rss_mib: rss_mib.map_or(f32::NAN, |mib| mib as f32),
+            gpu_mib: (self.gpu_bytes as f64 / MIB) as f32,
+            frames_queued: self.queued[0],
+            batches_queued: self.queued[1],
+            snapshots_queued: self.queued[2],
+            scale_source,
+            metres_per_unit,
+            scale_std,
+            warnings: self.warnings(silent_secs),
+        }
+    }
+}
+
+/// The status as `/diagnostics` has it: input, tracking, map.
+pub fn diagnostics(status: &MapperStatus, node: &str, silent_secs: f64) -> DiagnosticArray {
+    let part = |name: &str, (level, message): (u8, String), values: &[(&str, String)]| {
+        let value = |(key, value): &(&str, String)| KeyValue {
+            key: (*key).to_owned(),
+            value: value.clone(),
+        };
+        DiagnosticStatus {
+            level,
+            name: format!("{node}: {name}"),
+            message,
+            hardware_id: node.to_owned(),
+            values: values.iter().map(value).collect(),
+        }
+    };
+    let input = [
+        ("frames_received", status.frames_received.to_string()),
+        ("frames_dropped", status.frames_dropped.to_string()),
+        ("frames_undecodable", status.frames_undecodable.to_string()),
+        (
+            "frames_out_of_order",
+            status.frames_out_of_order.to_string(),
+        ),
+        ("frames_queued", status.frames_queued.to_string()),
+    ];
+    let tracking = [
+        ("frames_tracked", status.frames_tracked.to_string()),
+        ("frames_lost", status.frames_lost.to_string()),
+        (
+            "frame_to_pose_p50_ms",
+            status.frame_to_pose_p50_ms.to_string(),
+        ),
+        (
+            "frame_to_pose_p95_ms",
+            status.frame_to_pose_p95_ms.to_string(),
+        ),
+    ];
+    let map = [
+        ("keyframes_selected", status.keyframes_selected.to_string()),
+        (
+            "keyframes_registered",
+            status.keyframes_registered.to_string(),
+        ),
+        ("submaps", status.submaps.to_string()),
+        ("splats", status.splats.to_string()),
+        ("steps", status.steps.to_string()),
+        ("steps_per_s", status.steps_per_s.to_string()),
+        (
+            "keyframe_to_pose_p95_ms",
+            status.keyframe_to_pose_p95_ms.to_string(),
+        ),
+        ("epoch", status.epoch.to_string()),
+        ("revision", status.revision.to_string()),
+        ("rss_mib", status.rss_mib.to_string()),
+        ("gpu_mib", status.gpu_mib.to_string()),
+        ("metres_per_unit", status.metres_per_unit.to_string()),
+    ];
+    let [of_input, of_tracking, of_map] = levels(status, silent_secs);
+    DiagnosticArray {
+        header: Header {
+            frame_id: String::new(),
+            ..status.header.clone()
+        },
+        status: vec![
+            part("input", of_input, &input),
+            part("tracking", of_tracking, &tracking),
+            part("map", of_map, &map),
+        ],
+    }
+}
+
+/// (level, message) of input, tracking and map.
+fn levels(status: &MapperStatus, silent_secs: f64) -> [(u8, String); 3] {
+    let is_running = status.state < 4 || status.state == RECOVERING;
+    let silence = format!("no image for {silent_secs:.1} s");
+    let input = match silent_secs {
+        _ if !is_running => (DiagnosticStatus::OK, "paused or ended".to_owned()),
+        secs if secs > SILENT_SECS => (DiagnosticStatus::ERROR, silence),
+        secs if secs > SLOW_SECS => (DiagnosticStatus::WARN, silence),
+        _ => (DiagnosticStatus::OK, "images come".to_owned()),
+    };
+    let tracking = match status.state {
+        0 => (DiagnosticStatus::WARN, "no map yet".to_owned()),
+        2 => (DiagnosticStatus::ERROR, format!("lost: {}", status.reason)),
+        _ => (DiagnosticStatus::OK, "tracking".to_owned()),
+    };
+    let map = match status.warnings.first() {
+        _ if status.state == RECOVERING => (DiagnosticStatus::ERROR, status.reason.clone()),
+        None => (DiagnosticStatus::OK, "growing".to_owned()),
+        Some(first) => (DiagnosticStatus::WARN, first.clone()),
+    };
+    [input, tracking, map]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn diagnostics_give_a_camera_that_stops_from_one_that_runs() {
+        let status = Status {
+            tracked: Some(TrackState::Tracking),
+            is_calibrated: true,
+            ..Status::default()
+        };
+        let level = |silent_secs: f64, status: &Status| {
+            let status = status.message("map", Some(1.0), silent_secs);
+            diagnostics(&status, "mapper", silent_secs).status[0].level
+        };
+        assert_eq!([0.2, 1.5, 3.5].map(|secs| level(secs, &status)), [0, 1, 2]);
+        let paused = Status {
+            is_paused: true,
+            ..status.clone()
+        };
+        assert_eq!(level(9.0, &paused), DiagnosticStatus::OK);
+        let silent = status.message("map", None, 5.0);
+        assert!(
+            silent
+                .warnings
+                .iter()
+                .any(|w| w.contains("no image has come for 5 s"))
+        );
+    }
+
+    #[test]
+    fn percentiles_are_of_the_last_times() {
+        let mut times = Times::default();
+        assert!(times.percentile_ms(0.5).is_nan());
+        for i in 0..3000 {
+            times.note(if i < 2000 {
+                9.0
+            } else {
+                f64::from(i - 2000) * 1e-3
+            });
+        }
+        assert!((times.percentile_ms(0.5) - 500.0).abs() < 0.01);
+        assert!((times.percentile_ms(0.95) - 950.0).abs() < 0.01);
+    }
+}

@@ -1,0 +1,90 @@
+//! What all transports to the world have in common: topics with their delivery, and bytes on their way.
+//!
+//! A transport (ROS 2, zenoh, a recording) carries CDR bytes and knows nothing of what they mean.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use crate::error::PublishError;
+use splat_msgs::map_messages;
+use splat_msgs::ros::Message;
+use splat_types::time::Stamp;
+
+/// How messages of a topic travel, as REP-2003 asks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Delivery {
+    /// Reliable; who joins late gets the newest so many.
+    Latched { depth: usize },
+    /// Reliable; late joiners ask a service for what they missed.
+    Reliable { depth: usize },
+    /// The newest counts, others may be lost: poses.
+    Newest,
+}
+
+#[derive(Debug, PartialEq, Eq)]
+pub struct Topic {
+    /// `pose` stands below the node's own name, `/tf` stands alone.
+    pub name: &'static str,
+    /// Such as `nav_msgs/msg/Odometry`.
+    pub type_name: &'static str,
+    /// In `ros2msg` form.
+    pub definition: &'static str,
+    pub delivery: Delivery,
+}
+
+impl Topic {
+    pub const fn of<T: Message>(name: &'static str, delivery: Delivery) -> Self {
+        Self {
+            name,
+            type_name: T::TYPE_NAME,
+            definition: T::DEFINITION,
+            delivery,
+        }
+    }
+}
+
+/// A message ready to go, as often as it is asked for.
+#[derive(Debug, Clone)]
+pub struct Sample {
+    pub topic: &'static Topic,
+    /// Of what the message is about.
+    pub stamp: Stamp,
+    /// CDR with its four byte header.
+    pub payload: Arc<[u8]>,
+}
+
+impl Sample {
+    /// A message on a topic, whose type must be the topic's.
+    pub fn of<T: Message + Serialize>(
+        topic: &'static Topic,
+        stamp: Stamp,
+        message: &T,
+    ) -> Result<Self, PublishError> {
+        assert_eq!(
+            topic.type_name,
+            T::TYPE_NAME,
+            "{} carries its own type",
+            topic.name
+        );
+        Ok(Self {
+            topic,
+            stamp,
+            payload: map_messages::payload(message)?.into(),
+        })
+    }
+}
+
+/// A way out of the node. Called from several threads.
+pub trait Transport: Send + Sync {
+    /// Returns when the message is handed over; a slow peer may hold up messages of a reliable topic for a while.
+    fn send(&self, post: &Sample) -> Result<(), PublishError>;
+
+    /// Where peers may connect; none for most.
+    fn endpoints(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// Ends all that the transport has begun, within two seconds; later messages are left out.
+    fn close(&self) -> Result<(), PublishError>;
+}

@@ -1,0 +1,10 @@
+//! The same topics and services over zenoh, with the keys of rmw_zenoh.
+
+#[cfg(feature = "zenoh")]
+mod names;
+
+#[cfg(feature = "zenoh")]
+mod session;
+
+#[cfg(feature = "zenoh")]
+pub mod transport;

@@ -1,0 +1,7 @@
+//! The SLAM core: frames in, keyframes, poses and a map of splats out. No threads, no files, no clock of its own.
+
+pub mod select;
+
+pub mod track;
+
+pub mod mapper;

@@ -1,0 +1,7 @@
+//! The map as a file: sections with checksums.
+
+mod framing;
+
+pub(crate) mod sections;
+
+pub mod checkpoint;

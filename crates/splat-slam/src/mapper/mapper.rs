@@ -1,0 +1,494 @@
+//! Geometry of batches -> one map of splats and poses that grows, is optimised and can be copied.
+//!
+//! The only part that knows the map frame. Owns the engine; reads back from it only when a batch comes, at
+//! intervals of many steps, and for snapshots. The work is in its parts; this says in which order they act.
+
+mod evaluation;
+
+mod snapshots;
+
+mod recovery;
+
+mod reports;
+
+mod resumption;
+
+use std::sync::Arc;
+
+use crate::mapper::cameras::Cameras;
+use crate::mapper::depth_scale::scale_depths;
+use crate::mapper::keyframes::registered::RegisteredKeyframe;
+use crate::mapper::keyframes::residency::Residency;
+use crate::mapper::keyframes::store::{KeyframeStore, ROTATE_EVERY};
+use crate::mapper::keyframes::tracker_views::views_of;
+use crate::mapper::keyframes::training_image::{rescaled, training_image};
+use crate::mapper::last_good::LastGood;
+use crate::mapper::metric_scale::MetricScale;
+use crate::mapper::metric_scale_params::ScaleParams;
+use crate::mapper::pages::{PageStore, Paging};
+use crate::mapper::params::{MapperParams, PoseOptimization};
+use crate::mapper::parts::Parts;
+use crate::mapper::splats::store::SplatSet;
+use crate::mapper::submaps::pose_anchor::ANCHOR_EVERY;
+use crate::mapper::submaps::registry::Submaps;
+use crate::mapper::train::schedule::Phase;
+use crate::mapper::train::trainer::Trainer;
+use crate::track::landmarks::KeyframeView;
+use splat_engine::error::EngineError;
+use splat_engine::settings::PoseMode;
+use splat_engine::traits::Engine;
+use splat_engine::view::TrainingView;
+use splat_geometry::answer::{GeometryBatch, PoseStd, View};
+use splat_types::correction::{MapCorrection, Reason};
+use splat_types::frame::Batch;
+use splat_types::snapshot::Scale;
+
+/// Keyframes without a pose that are kept in case the model places them later.
+pub const MAX_WAITING: usize = 200;
+/// Steps between looks at a view for holes and errors, and between removals of transparent splats.
+const RESEED_EVERY: u64 = 50;
+const PRUNE_EVERY: u64 = 400;
+/// Seeding and removal end here, as a share of the final steps: what comes later has no time to converge.
+const LAST_RESEED: f32 = 0.6;
+
+/// All splats and poses, and the engine that improves them. More than 30 methods: it is the one face of the map, and each
+/// of its users needs a few.
+pub struct Mapper {
+    params: MapperParams,
+    seed: u64,
+    engine: Box<dyn Engine>,
+    paging: Paging,
+    keyframes: KeyframeStore,
+    submaps: Submaps,
+    splats: SplatSet,
+    trainer: Trainer,
+    scale: MetricScale,
+    /// `None` before anything was read.
+    last_good: Option<Arc<LastGood>>,
+}
+
+impl std::fmt::Debug for Mapper {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (n_keyframes, n_splats) = (self.n_keyframes(), self.n_splats());
+        write!(f, "Mapper({n_keyframes} keyframes, {n_splats} splats)")
+    }
+}
+
+impl Mapper {
+    pub fn new(params: MapperParams, seed: u64, scale: Scale, engine: Box<dyn Engine>) -> Self {
+        Self {
+            params,
+            seed,
+            engine,
+            paging: Paging::default(),
+            keyframes: KeyframeStore::default(),
+            submaps: Submaps::default(),
+            splats: SplatSet::default(),
+            trainer: Trainer::new(seed),
+            scale: MetricScale::new(scale),
+            last_good: None,
+        }
+    }
+
+    /// From now on looks for metres by these parameters, unless the geometry has them.
+    #[must_use]
+    pub fn measuring_scale(mut self, params: &ScaleParams) -> Self {
+        self.scale.look_for(params);
+        self
+    }
+
+    /// Where splats and images go that memory has no room for; without a store they are lost.
+    #[must_use]
+    pub fn paging_to(mut self, pages: Box<dyn PageStore>) -> Self {
+        self.paging = Paging::to(pages);
+        self
+    }
+
+    /// Adds what the model says of a batch; `progress` is the share of the input that has come, where known.
+    /// Returns the ids of the keyframes that are in the map since. After a fault, and `recover`, it must be added again.
+    pub fn add(
+        &mut self,
+        batch: Option<&Batch>,
+        geometry: &GeometryBatch,
+        progress: Option<f64>,
+    ) -> Result<Vec<u32>, EngineError> {
+        if let Some(batch) = batch {
+            let given_up = self.keyframes.remember(&batch.keyframes, MAX_WAITING);
+            self.submaps.forget(&given_up);
+        }
+        self.splats.set_progress(progress);
+        self.find_prior(batch, geometry)?;
+        self.hold_anchor()?;
+        let (keyframes, engine) = (&mut self.keyframes, &mut *self.engine);
+        let update = self.submaps.apply_updates(geometry, keyframes, engine)?;
+        if update.has_moved {
+            self.trainer.reset_convergence();
+        }
+        self.place(update.joined, PoseStd::default())?;
+        let (parts, trainer) = self.split();
+        trainer.record_observations(&parts, &geometry.observations);
+        let mut own = self.submaps.sort(&geometry.views, &self.keyframes);
+        own.extend(if self.submaps.prior().is_some() {
+            self.register_resumed()?
+        } else {
+            self.restart_from()?
+        });
+        let fresh = self.place(own, geometry.pose_error)?;
+        self.enforce_budget(0)?;
+        self.keyframes.subsample_old_depth(&mut *self.engine)?;
+        let (mut parts, trainer) = self.split();
+        trainer.match_views(&mut parts)?;
+        self.set_anchor()?;
+        self.splats.note_peaks(&*self.engine);
+        self.keep_good()?;
+        Ok(fresh)
+    }
+
+    /// One optimiser update per step, with seeding and removal at their intervals. Returns the steps made, which
+    /// are fewer only when there is nothing to train on.
+    pub fn step(&mut self, n: u64, phase: Phase) -> Result<u64, EngineError> {
+        if phase != Phase::Streaming {
+            self.splats.set_progress(None);
+        }
+        if self.submaps.waits_for_registration() {
+            return Ok(0);
+        }
+        for done in 0..n {
+            let (mut parts, trainer) = self.split();
+            let Some(settings) = trainer.step(&mut parts, phase)? else {
+                return Ok(done);
+            };
+            let n_steps = trainer.n_steps();
+            let may_change = !matches!(phase, Phase::Final(share) if share > LAST_RESEED);
+            if may_change && n_steps.is_multiple_of(RESEED_EVERY) {
+                trainer.seed_and_mask(&mut parts, phase)?;
+            }
+            trainer.record_loss_at_interval(parts.engine)?;
+            if may_change && n_steps.is_multiple_of(PRUNE_EVERY) {
+                parts.splats.prune(parts.params, parts.engine)?;
+            }
+            let mcmc = &parts.params.mcmc;
+            let may_move = may_change && mcmc.enabled && n_steps >= mcmc.start;
+            if may_move && n_steps.is_multiple_of(mcmc.every) {
+                trainer.relocate(&mut parts)?;
+            }
+            self.report_renumbered();
+            if n_steps.is_multiple_of(ROTATE_EVERY) {
+                self.rotate()?;
+                self.splats.note_peaks(&*self.engine);
+            }
+            if n_steps.is_multiple_of(ANCHOR_EVERY) {
+                if settings.pose != PoseMode::Held {
+                    self.hold_anchor()?;
+                }
+                let source = self.scale.scale().source;
+                scale_depths(source, &mut self.keyframes, &mut *self.engine)?;
+            }
+        }
+        Ok(n)
+    }
+
+    /// (id, is held out) of every keyframe in the map that has an image, and nothing on disk of what it shows.
+    pub fn keyframe_ids(&self) -> Vec<(u32, bool)> {
+        self.keyframes
+            .registered()
+            .iter()
+            .filter(|(_, p)| (p.home.is_here || p.home.copy.is_some()) && !p.home.rests)
+            .map(|(id, registered)| (*id, registered.is_held_out))
+            .collect()
+    }
+
+    /// Keyframes per submap: the map's first, then those that have no known relation to it.
+    pub fn submaps(&self) -> Vec<usize> {
+        let own = self.keyframes.registered().len();
+        let detached = self.submaps.detached_counts();
+        (own > 0)
+            .then_some(own)
+            .into_iter()
+            .chain(detached.into_values())
+            .collect()
+    }
+
+    pub fn n_keyframes(&self) -> usize {
+        self.keyframes.registered().len()
+    }
+
+    pub fn has_keyframe(&self, keyframe_id: u32) -> bool {
+        self.keyframes.registered().contains_key(&keyframe_id)
+    }
+
+    pub fn n_splats(&self) -> usize {
+        self.engine.len()
+    }
+
+    pub fn n_steps(&self) -> u64 {
+        self.trainer.n_steps()
+    }
+
+    pub fn peak_gpu_bytes(&self) -> u64 {
+        self.engine.memory().peak_gpu_bytes
+    }
+
+    pub fn adapter(&self) -> String {
+        self.engine.adapter()
+    }
+
+    /// The correction since this was last called.
+    pub fn take_correction(&mut self) -> Option<MapCorrection> {
+        self.submaps.take_correction()
+    }
+
+    /// All keyframes as they stand at this moment, in order of id.
+    pub fn keyframe_views(&mut self) -> Result<Vec<KeyframeView>, EngineError> {
+        let cameras = Cameras::read(&mut *self.engine)?;
+        Ok(views_of(&self.keyframes, &cameras))
+    }
+
+    /// What operations on splats need, and who performs them.
+    fn split(&mut self) -> (Parts<'_>, &mut Trainer) {
+        let parts = Parts {
+            params: &self.params,
+            engine: &mut *self.engine,
+            keyframes: &mut self.keyframes,
+            splats: &mut self.splats,
+        };
+        (parts, &mut self.trainer)
+    }
+
+    /// Looks for keyframes of this run in the saved map.
+    fn find_prior(
+        &mut self,
+        batch: Option<&Batch>,
+        geometry: &GeometryBatch,
+    ) -> Result<(), EngineError> {
+        let mut parts = Parts {
+            params: &self.params,
+            engine: &mut *self.engine,
+            keyframes: &mut self.keyframes,
+            splats: &mut self.splats,
+        };
+        match self.submaps.prior_mut() {
+            Some(prior) => prior.look_for(&mut parts, batch, geometry),
+            None => Ok(()),
+        }
+    }
+
+    /// This run's views, once its geometry has got its place in the saved map.
+    fn register_resumed(&mut self) -> Result<Vec<View>, EngineError> {
+        let prior = self.submaps.prior_mut();
+        let Some((submap, world_from_submap)) = prior.and_then(|prior| prior.align()) else {
+            return Ok(Vec::new());
+        };
+        let map_poses = self.engine.poses()?;
+        let keyframes = &mut self.keyframes;
+        let views = self
+            .submaps
+            .take_frame(submap, &world_from_submap, keyframes, &map_poses);
+        self.scale.take_over(1.0 / world_from_submap.scale);
+        Ok(views)
+    }
+
+    fn restart_from(&mut self) -> Result<Vec<View>, EngineError> {
+        let (keyframes, splats) = (&mut self.keyframes, &mut self.splats);
+        let restarted = self
+            .submaps
+            .restart_from(keyframes, splats, &mut *self.engine)?;
+        if restarted.is_some() {
+            self.trainer.set_trainable(Vec::new());
+        }
+        Ok(restarted.unwrap_or_default())
+    }
+
+    fn hold_anchor(&mut self) -> Result<(), EngineError> {
+        let anchor = self.submaps.anchor();
+        anchor.hold(&self.keyframes, &mut *self.engine)
+    }
+
+    fn set_anchor(&mut self) -> Result<(), EngineError> {
+        let has_network = self.params.train.pose_opt == PoseOptimization::Network;
+        let seed = has_network.then_some(self.seed);
+        let anchor = self.submaps.anchor();
+        anchor.set(seed, &self.keyframes, &mut *self.engine)
+    }
+
+    fn choose_trainable(&mut self) -> Result<(), EngineError> {
+        let (keyframes, engine) = (&mut self.keyframes, &mut *self.engine);
+        self.splats.mark_paged_out(keyframes, engine)?;
+        self.trainer.set_trainable(self.keyframes.trainable());
+        Ok(())
+    }
+
+    /// Keeps as many keyframes in memory as there may be, less room for those that come.
+    fn enforce_budget(&mut self, n_coming: usize) -> Result<(), EngineError> {
+        let has_left = self.keyframes.enforce_budget(
+            n_coming,
+            &self.params,
+            &mut *self.engine,
+            &mut self.paging,
+            self.scale.params(),
+        )?;
+        if has_left {
+            self.choose_trainable()?;
+        }
+        Ok(())
+    }
+
+    fn rotate(&mut self) -> Result<(), EngineError> {
+        let may_have_left = self.keyframes.rotate(
+            &self.params,
+            &mut *self.engine,
+            &mut self.paging,
+            self.scale.params(),
+            self.trainer.rng(),
+        )?;
+        if may_have_left {
+            self.choose_trainable()?;
+        }
+        Ok(())
+    }
+
+    /// The image of a keyframe comes into memory for a moment: another makes room for it. Whoever asks sends it away again.
+    fn with_resident(&mut self, id: u32) -> Result<bool, EngineError> {
+        let registered = self.keyframes.registered().get(&id);
+        if registered.is_some_and(|p| !p.home.is_here && p.home.copy.is_some()) {
+            self.enforce_budget(1)?;
+        }
+        self.keyframes.page_in(id, &mut *self.engine)
+    }
+
+    fn page_out(&mut self, id: u32) -> Result<(), EngineError> {
+        let (paging, metres) = (&mut self.paging, self.scale.params());
+        self.keyframes
+            .page_out(id, &mut *self.engine, paging, metres)
+    }
+
+    /// Brings back what is near, and makes room for that and for `n_wanted` more splats, as far as there is anything far.
+    fn balance(&mut self, n_wanted: usize) -> Result<(), EngineError> {
+        let (params, engine) = (&self.params, &mut *self.engine);
+        let plan = self
+            .splats
+            .plan(n_wanted, params, &self.keyframes, engine)?;
+        let Some(plan) = plan else {
+            return Ok(());
+        };
+        if plan.n_over > 0 {
+            self.evict_far((plan.n_over, plan.beyond), &plan.away)?;
+        }
+        let (keyframes, engine) = (&self.keyframes, &mut *self.engine);
+        if self.splats.restore_near(&plan, keyframes, engine)? {
+            self.choose_trainable()?;
+            self.splats.note_peaks(&*self.engine);
+        }
+        Ok(())
+    }
+
+    fn evict_far(
+        &mut self,
+        most: (usize, f64),
+        away: &std::collections::BTreeMap<u32, f64>,
+    ) -> Result<(), EngineError> {
+        let (keyframes, engine) = (&self.keyframes, &mut *self.engine);
+        let paging = &mut self.paging;
+        let splats = &mut self.splats;
+        if splats.evict_far(most, away, keyframes, engine, paging)? {
+            self.choose_trainable()?;
+        }
+        Ok(())
+    }
+
+    fn seed_all(&mut self, fresh: &[u32], deepened: &[u32]) -> Result<(), EngineError> {
+        if !fresh.is_empty() || !deepened.is_empty() {
+            self.trainer.reset_convergence();
+        }
+        let has_depth = |id: &&u32| self.keyframes.registered()[*id].depth.width_px > 0;
+        let fresh = fresh.iter().filter(has_depth);
+        let ids: Vec<u32> = fresh.chain(deepened).copied().collect();
+        self.balance(ids.len() * self.params.train.seeds_per_keyframe)?;
+        let (mut parts, trainer) = self.split();
+        trainer.seed_each(&mut parts, &ids)?;
+        self.report_renumbered();
+        Ok(())
+    }
+
+    fn report_renumbered(&mut self) {
+        if self.splats.take_renumbered() {
+            let correction = MapCorrection::identity(Reason::Renumbered);
+            self.submaps.start_epoch(correction);
+        }
+    }
+
+    /// Gives views of the map's own submap their place, and seeds splats from them.
+    fn place(&mut self, views: Vec<View>, pose_error: PoseStd) -> Result<Vec<u32>, EngineError> {
+        if views.is_empty() {
+            return Ok(Vec::new());
+        }
+        let map_poses = self.engine.poses()?;
+        let world_from_submap = self.keyframes.world_from_submap(&map_poses);
+        self.keyframes.note_pose_error(
+            pose_error.rotation_rad as f32,
+            (pose_error.translation * world_from_submap.scale) as f32,
+        );
+        let is_new = |view: &&View| !self.has_keyframe(view.keyframe_id);
+        self.enforce_budget(views.iter().filter(is_new).count())?;
+        let max_side = self.params.train.max_side;
+        let (mut fresh, mut deepened) = (Vec::new(), Vec::new());
+        for view in views {
+            let given = self.keyframes.registered().get(&view.keyframe_id);
+            let factor =
+                world_from_submap.scale * given.map_or(1.0, |registered| registered.depth_factor);
+            let depth = Arc::new(rescaled(&view.depth, factor));
+            let median_depth = depth.median();
+            if self.has_keyframe(view.keyframe_id) {
+                if self
+                    .keyframes
+                    .update_depth(&view, depth, max_side, &mut *self.engine)?
+                {
+                    deepened.push(view.keyframe_id);
+                }
+            } else if let Some(keyframe) = self.keyframes.take_waiting(view.keyframe_id) {
+                let (image, intrinsics) = training_image(&keyframe, &view, max_side);
+                let cam_from_world = world_from_submap
+                    .transform_pose(&view.submap_from_cam)
+                    .inverse();
+                let view_ix = self.engine.add_view(TrainingView {
+                    image: Arc::clone(&image),
+                    intrinsics,
+                    cam_from_world,
+                    depth: Some(Arc::clone(&depth)),
+                    mask: None,
+                })?;
+                let every = self.params.map.holdout;
+                let is_held_out = keyframe.frame.is_held_out
+                    || (every > 0 && view.keyframe_id % every == every / 2);
+                let id = view.keyframe_id;
+                self.keyframes.insert(
+                    id,
+                    RegisteredKeyframe {
+                        keyframe,
+                        view_ix,
+                        submap_from_cam: view.submap_from_cam,
+                        image,
+                        intrinsics,
+                        lens: view.lens,
+                        depth,
+                        median_depth,
+                        depth_factor: 1.0,
+                        n_depth_looks: 0,
+                        ratios: None,
+                        health: view.health,
+                        is_held_out,
+                        home: Residency::here(),
+                    },
+                );
+                if !is_held_out {
+                    self.trainer.add_trainable(view_ix);
+                }
+                fresh.push(id);
+            }
+        }
+        self.keyframes.measure_scene();
+        self.splats.prune(&self.params, &mut *self.engine)?;
+        self.seed_all(&fresh, &deepened)?;
+        Ok(fresh)
+    }
+}

@@ -1,0 +1,234 @@
+//! What is known in metres beside the map -> metres of one map unit, with its standard deviation.
+//!
+//! A camera alone shows no lengths. Wheels, a depth camera, the height at which the camera is mounted or one measured
+//! distance do; each gives many ratios, of which some are wrong: the median of their logarithms, then Huber's mean.
+
+#[cfg(test)]
+mod tests;
+
+use crate::mapper::keyframes::metric_ratios;
+use crate::mapper::keyframes::registered::RegisteredKeyframe;
+use crate::mapper::keyframes::store::KeyframeStore;
+use crate::mapper::metric_scale_params::{MetricSource, ScaleParams};
+use splat_types::snapshot::{KeyframePose, Scale, ScaleSource};
+use splat_types::time::Stamp;
+use splat_types::transform::Rigid;
+
+/// Ratios below which nothing is said.
+const MIN_RATIOS: usize = 5;
+/// A relative standard deviation above is no knowledge.
+const MAX_STD: f64 = 0.1;
+/// The path is cut into so many segments: long ones drown the noise of single poses, many report how well they agree.
+const N_SEGMENTS: f64 = 24.0;
+/// Huber's loss bends at so many standard deviations, for so many rounds.
+const HUBER: f64 = 1.5;
+const ROUNDS: usize = 5;
+/// Standard deviation of a normal distribution over its median absolute deviation.
+const NORMAL_MAD: f64 = 1.4826;
+/// What depth cameras and measured heights are off by in common, which no number of ratios shows.
+const DEPTH_ERROR: f64 = 0.005;
+const HEIGHT_ERROR: f64 = 0.02;
+/// Places that one measured distance rests on are known to such a share of it.
+const BASELINE_ERROR: f64 = 0.01;
+
+/// The logarithm of metres per unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Estimate {
+    log: f64,
+    std: f64,
+}
+
+/// Of independent ratios; `common` is what all of them may be off by together. `None` where they are few or disagree.
+fn robust(mut logs: Vec<f64>, common: f64) -> Option<Estimate> {
+    logs.retain(|l| l.is_finite());
+    if logs.len() < MIN_RATIOS {
+        return None;
+    }
+    logs.sort_by(f64::total_cmp);
+    let mut mean = logs[logs.len() / 2];
+    let mut off: Vec<f64> = logs.iter().map(|l| (l - mean).abs()).collect();
+    off.sort_by(f64::total_cmp);
+    let spread = (NORMAL_MAD * off[off.len() / 2]).max(1e-6);
+    let bend = HUBER * spread;
+    let mut n_effective = 0.0;
+    for _ in 0..ROUNDS {
+        let weight = |l: &f64| (bend / (l - mean).abs()).min(1.0);
+        n_effective = logs.iter().map(weight).sum::<f64>();
+        mean = logs.iter().map(|l| weight(l) * l).sum::<f64>() / n_effective;
+    }
+    let std = (spread * spread / n_effective + common * common).sqrt();
+    (std <= MAX_STD).then_some(Estimate { log: mean, std })
+}
+
+/// (world_from_cam, odom_from_cam in metres) of keyframes in order. Odometry drifts, so only its steps count.
+fn of_odometry(track: &[(Rigid, Rigid)], common: f64) -> Option<Estimate> {
+    let step = |a: &Rigid, b: &Rigid| (a.translation - b.translation).length();
+    let path: f64 = track.windows(2).map(|two| step(&two[0].0, &two[1].0)).sum();
+    let length = path / N_SEGMENTS;
+    let (mut logs, mut start) = (Vec::new(), track.first()?);
+    for end in track {
+        let in_world = step(&start.0, &end.0);
+        if in_world >= length && in_world > 0.0 {
+            // Where wheels say that nothing moved, the logarithm is no number and goes.
+            logs.push((step(&start.1, &end.1) / in_world).ln());
+            start = end;
+        }
+    }
+    robust(logs, common)
+}
+
+/// A distance that somebody measured between the camera's places at two times.
+fn of_baseline(poses: &[KeyframePose], (from, to, metres): (f64, f64, f64)) -> Option<Estimate> {
+    let first = poses.first()?.stamp;
+    let nearest = |secs: f64| {
+        let off = |p: &&KeyframePose| (p.stamp.secs_since(first) - secs).abs();
+        poses.iter().min_by(|a, b| off(a).total_cmp(&off(b)))
+    };
+    let (a, b) = (nearest(from)?, nearest(to)?);
+    let units = (a.world_from_cam.translation - b.world_from_cam.translation).length();
+    let log = (metres / units).ln();
+    log.is_finite().then_some(Estimate {
+        log,
+        std: BASELINE_ERROR,
+    })
+}
+
+/// Metres of one map unit, as far as anything reports them.
+#[derive(Debug)]
+pub(crate) struct MetricScale {
+    scale: Scale,
+    /// What is looked for; `None`: nothing.
+    params: Option<ScaleParams>,
+    /// The model's lengths are metres.
+    is_given: bool,
+}
+
+impl MetricScale {
+    pub(crate) fn new(scale: Scale) -> Self {
+        Self {
+            scale,
+            params: None,
+            is_given: scale == Scale::GIVEN,
+        }
+    }
+
+    /// From now on looks for metres by these parameters, unless the geometry has them.
+    pub(crate) fn look_for(&mut self, params: &ScaleParams) {
+        self.params = Some(params.clone());
+    }
+
+    pub(crate) fn params(&self) -> Option<&ScaleParams> {
+        self.params.as_ref()
+    }
+
+    pub(crate) fn scale(&self) -> Scale {
+        self.scale
+    }
+
+    pub(crate) fn set(&mut self, scale: Scale) {
+        self.scale = scale;
+    }
+
+    /// A model that knows metres reports them of a map that had none.
+    pub(crate) fn take_over(&mut self, metres_per_unit: f64) {
+        if self.is_given && self.scale.source != ScaleSource::Given {
+            self.scale = Scale {
+                metres_per_unit: Some(metres_per_unit),
+                ..Scale::GIVEN
+            };
+        }
+    }
+
+    /// Metres per unit as far as anything reports; `poses` as a snapshot has them.
+    pub(crate) fn measure(
+        &self,
+        keyframes: &mut KeyframeStore,
+        poses: &[KeyframePose],
+        prior: Option<Scale>,
+    ) -> Scale {
+        let Some(params) = self.params.clone() else {
+            return self.scale;
+        };
+        if self.scale.source == ScaleSource::Given || params.source == MetricSource::Off {
+            return self.scale;
+        }
+        for registered in keyframes.values_mut() {
+            metric_ratios::measure(registered, &params);
+        }
+        let found = estimates(&params, keyframes.registered().values(), poses);
+        let best = found
+            .into_iter()
+            .filter_map(|(source, estimate)| Some((source, estimate?)))
+            .min_by(|a, b| a.1.std.total_cmp(&b.1.std));
+        // What a saved map knows better stays.
+        let known = prior.and_then(|prior| prior.relative_std());
+        if let Some(known) = known
+            && best.is_none_or(|(_, estimate)| known <= estimate.std)
+        {
+            return prior.unwrap_or(self.scale);
+        }
+        let scale = best.map_or(Scale::UP_TO_SCALE, |(source, estimate)| {
+            let metres = estimate.log.exp();
+            Scale {
+                source,
+                metres_per_unit: Some(metres),
+                std: Some(metres * estimate.std),
+            }
+        });
+        if scale.source != self.scale.source {
+            tracing::info!(
+                source = scale.source.name(),
+                metres_per_unit = scale.metres_per_unit,
+                std = scale.std,
+                "scale of the map"
+            );
+        }
+        scale
+    }
+}
+
+/// What each source that is allowed says.
+fn estimates<'a>(
+    params: &ScaleParams,
+    registered: impl Iterator<Item = &'a RegisteredKeyframe>,
+    poses: &[KeyframePose],
+) -> Vec<(ScaleSource, Option<Estimate>)> {
+    let may = |known: MetricSource| params.source == MetricSource::Auto || params.source == known;
+    let registered: Vec<&RegisteredKeyframe> = registered.collect();
+    let all = |which: usize| {
+        registered
+            .iter()
+            .filter_map(|p| metric_ratios::ratio(p, which))
+            .collect::<Vec<_>>()
+    };
+    let mut found = Vec::new();
+    if may(MetricSource::Odometry) {
+        let track: Vec<(Rigid, Rigid)> = registered
+            .iter()
+            .filter_map(|p| {
+                let pose = pose_at(poses, p.keyframe.frame.stamp)?;
+                Some((pose, p.keyframe.frame.odometry?))
+            })
+            .collect();
+        let estimate = of_odometry(&track, params.odometry_error);
+        found.push((ScaleSource::Odometry, estimate));
+    }
+    if may(MetricSource::Depth) {
+        found.push((ScaleSource::Depth, robust(all(0), DEPTH_ERROR)));
+    }
+    if may(MetricSource::Height) {
+        found.push((ScaleSource::Height, robust(all(1), HEIGHT_ERROR)));
+    }
+    if let Some(baseline) = params
+        .baseline_secs()
+        .filter(|_| may(MetricSource::Baseline))
+    {
+        found.push((ScaleSource::Baseline, of_baseline(poses, baseline)));
+    }
+    found
+}
+
+fn pose_at(poses: &[KeyframePose], stamp: Stamp) -> Option<Rigid> {
+    let ix = poses.binary_search_by_key(&stamp, |p| p.stamp).ok()?;
+    Some(poses[ix].world_from_cam)
+}

@@ -1,0 +1,245 @@
+//! Parameters of mapping: `map.*`, `train.*`, `mcmc.*`.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// All that the map needs.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct MapperParams {
+    pub map: MapParams,
+    pub train: TrainParams,
+    pub mcmc: McmcParams,
+}
+
+/// Parameters `map.*`: budgets of memory and disk, files, snapshots.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct MapParams {
+    /// Cap on splats in memory. Beyond it those far from the camera are paged out to disk and paged in when it is
+    /// near; where all are near, seeding stops.
+    #[schemars(range(min = 100, max = 20000000))]
+    pub max_splats: usize,
+    /// Cap on the memory of the engine (on a GPU all its buffers, else splats, their optimiser and the training
+    /// images); 0 = none.
+    #[schemars(range(min = 0, max = 1048576), extend("unit" = "MiB"))]
+    pub max_gpu_mib: u64,
+    /// Images and depth of more keyframes are paged out to disk and trained in turns; at least 8; 0 = no cap.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub max_resident_keyframes: usize,
+    /// Cap on the page file, which has no name and lies in the run directory.
+    #[schemars(range(min = 0, max = 16777216), extend("unit" = "MiB"))]
+    pub max_page_file_mib: u64,
+    /// .splatmap of an earlier run to resume, as --resume; empty = start a new map.
+    pub resume: String,
+    /// Images of keyframes in the map file, some 50 KiB each, so that a later run can train on them; subsampled
+    /// evenly where all would be more; 0 = none.
+    #[schemars(range(min = 0, max = 1048576), extend("unit" = "MiB"))]
+    pub save_images_mib: u64,
+    /// Time between writes of the run directory's map.splatmap during a run; 0 = only at its end.
+    #[schemars(range(min = 0.0, max = 86400.0), extend("unit" = "s"))]
+    pub autosave_secs: f64,
+    /// Every n-th keyframe is kept out of optimisation to measure quality; 0 = off.
+    #[schemars(range(min = 0, max = 1000))]
+    pub holdout: u32,
+    /// Wall time between snapshots for publishers.
+    #[schemars(range(min = 0.05, max = 3600.0), extend("unit" = "s"))]
+    pub snapshot_secs: f64,
+}
+
+impl Default for MapParams {
+    fn default() -> Self {
+        Self {
+            max_splats: 60000,
+            max_gpu_mib: 0,
+            max_resident_keyframes: 400,
+            max_page_file_mib: 8192,
+            resume: String::new(),
+            save_images_mib: 64,
+            autosave_secs: 0.0,
+            holdout: 8,
+            snapshot_secs: 2.0,
+        }
+    }
+}
+
+/// Parameters `train.*`: steps, losses and learning rates of the optimisation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainParams {
+    /// Optimiser updates of the whole run, spread over the batches and the end.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub steps: u64,
+    /// Longer side of the image that splats are trained on.
+    #[schemars(range(min = 16, max = 4096), extend("unit" = "px"))]
+    pub max_side: u32,
+    /// Share of the steps that are made after the last keyframe.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub final_share: f64,
+    /// Splats that a keyframe may add where the map has none yet.
+    #[schemars(range(min = 1, max = 1000000))]
+    pub seeds_per_keyframe: usize,
+    /// Highest band of view-dependent colour.
+    #[schemars(range(min = 0, max = 3))]
+    pub sh_degree: u8,
+    /// Share of 1 - SSIM in the photometric loss.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub ssim_weight: f32,
+    /// Weight of the depth loss; decays to a tenth over the run.
+    #[schemars(range(min = 0.0, max = 100.0))]
+    pub depth_weight: f32,
+    /// What the depth loss compares: inverse depth; as the code of FastSplatting; as its paper.
+    pub depth_mode: DepthLoss,
+    /// Weight of the epipolar distance in px over the correspondences of a view (3R-GS); 0 = off.
+    #[schemars(range(min = 0.0, max = 100.0))]
+    pub epipolar_weight: f32,
+    /// Share of an image's pixels that surely are static; worse ones in clusters lose their weight (RobustNeRF);
+    /// 1 = off.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub robust_inlier_fraction: f32,
+    /// Adam rate, share of the scene scale; decays to a hundredth over the run.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_mean: f32,
+    /// Adam rate of log-scales.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_scale: f32,
+    /// Adam rate of quaternions.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_quat: f32,
+    /// Adam rate of opacity logits.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_opacity: f32,
+    /// Adam rate of the base colour; the bands above take a twentieth.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_sh: f32,
+    /// Updates of a splat before each further band of its colour is trained; 0 = by the share of the final steps.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub sh_interval: u32,
+    /// Pose optimisation: per view, by a shared MLP (3R-GS) and per view, or none.
+    pub pose_opt: PoseOptimization,
+    /// Adam rate of a view's own rotation, pose_opt per_view and network; decays to 3 % over the run; 0 fixes it.
+    #[schemars(range(min = 0.0, max = 1.0), extend("unit" = "rad"))]
+    pub lr_rotation: f32,
+    /// Adam rate of a view's own translation, share of the scene scale; decays the same way; 0 fixes it.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_translation: f32,
+    /// Adam rate of the network and of its embedding of each view, pose_opt network.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_pose_network: f32,
+    /// Adam rate of the logarithm of one factor on all focal lengths; 0 fixes it.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_focal: f32,
+    /// Adam rate of each view's gain and offset of r, g, b; 0 = none.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_exposure: f32,
+}
+
+impl Default for TrainParams {
+    fn default() -> Self {
+        Self {
+            steps: 3000,
+            max_side: 480,
+            final_share: 0.5,
+            seeds_per_keyframe: 2500,
+            sh_degree: 1,
+            ssim_weight: 0.2,
+            depth_weight: 0.1,
+            depth_mode: DepthLoss::InvDepth,
+            epipolar_weight: 0.0,
+            robust_inlier_fraction: 1.0,
+            lr_mean: 0.00016,
+            lr_scale: 0.005,
+            lr_quat: 0.001,
+            lr_opacity: 0.05,
+            lr_sh: 0.0025,
+            sh_interval: 0,
+            pose_opt: PoseOptimization::PerView,
+            lr_rotation: 0.0005,
+            lr_translation: 0.0005,
+            lr_pose_network: 0.001,
+            lr_focal: 0.0,
+            lr_exposure: 0.0,
+        }
+    }
+}
+
+/// Parameters `mcmc.*`: relocation, growth and regularisation of 3DGS-MCMC.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct McmcParams {
+    /// Dead splats are relocated to live ones instead of removed, and some are added (3DGS-MCMC).
+    pub enabled: bool,
+    /// Steps between relocations.
+    #[schemars(range(min = 1, max = 1000000))]
+    pub every: u64,
+    /// Step of the first relocation.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub start: u64,
+    /// Splats after a relocation as a multiple of those before, up to map.max_splats.
+    #[schemars(range(min = 1.0, max = 2.0))]
+    pub growth: f32,
+    /// What splats at one position preserve of the splat that they replace: the sums of its alpha and alpha
+    /// squared over the image; the opacity along a ray through its centre, as in the paper of 3DGS-MCMC.
+    pub relocation: RelocationRule,
+    /// SGLD noise on the means, multiple of train.lr_mean, with mcmc.enabled; 0 = none.
+    #[schemars(range(min = 0.0, max = 1e9))]
+    pub noise: f32,
+    /// Weight of the mean opacity, with mcmc.enabled.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub opacity_reg: f32,
+    /// Weight of the mean scale as a share of the scene scale, with mcmc.enabled.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub scale_reg: f32,
+    /// Splats below it are dead: removed with each batch and at intervals, or relocated with mcmc.enabled.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub min_opacity: f32,
+}
+
+impl Default for McmcParams {
+    fn default() -> Self {
+        Self {
+            enabled: false,
+            every: 100,
+            start: 500,
+            growth: 1.05,
+            relocation: RelocationRule::Image,
+            noise: 500000.0,
+            opacity_reg: 0.01,
+            scale_reg: 0.01,
+            min_opacity: 0.02,
+        }
+    }
+}
+
+/// How keyframe poses are optimised with the splats.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseOptimization {
+    /// Each view by itself.
+    PerView,
+    /// By an MLP that all views share (3R-GS), and per view.
+    Network,
+    /// Not at all.
+    Fixed,
+}
+
+/// What the depth loss compares.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum DepthLoss {
+    /// Inverse depth.
+    InvDepth,
+    /// As the code of FastSplatting.
+    PaperCode,
+    /// As its paper.
+    PaperAlpha,
+}
+
+/// What splats at one position preserve of the splat that they replace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RelocationRule {
+    /// The sums of its alpha and alpha squared over the image.
+    Image,
+    /// The opacity along a ray through its centre (3DGS-MCMC).
+    Paper,
+}

@@ -1,0 +1,11 @@
+//! Splats of the map: ids, motions with cameras, and regions on disk.
+
+pub mod transform;
+
+mod ids;
+
+pub(crate) mod region_codec;
+
+pub mod regions;
+
+pub(crate) mod store;

@@ -1,0 +1,137 @@
+//! Splats come where a view shows holes or errors, and go, or move, when they have become transparent.
+
+use rand::Rng;
+
+use crate::mapper::params::RelocationRule;
+use crate::mapper::parts::Parts;
+use crate::mapper::train::seed::{self, SeedView};
+use crate::mapper::train::transient;
+use splat_engine::error::EngineError;
+use splat_engine::mcmc::Relocation;
+use splat_engine::settings::McmcSettings;
+use splat_types::camera::Intrinsics;
+use splat_types::rendering::Rendering;
+use splat_types::transform::Rigid;
+
+/// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
+/// is not under optimisation, and its splats are no measure of anything.
+const ACTIVE_ROUNDS: usize = 4;
+const MIN_ACTIVE_STEPS: usize = 500;
+
+pub(crate) fn seed_from(
+    map: &mut Parts<'_>,
+    rng: &mut impl Rng,
+    keyframe_id: u32,
+    fills_gaps: bool,
+) -> Result<(), EngineError> {
+    let room = map
+        .splats
+        .cap(map.params, map.keyframes, map.engine)
+        .saturating_sub(map.engine.len());
+    if room == 0 {
+        return Ok(());
+    }
+    let Some(camera) = camera(map, keyframe_id)? else {
+        return Ok(());
+    };
+    let rendering = shown(map, &camera, 0)?;
+    let Some(registered) = map
+        .keyframes
+        .registered()
+        .get(&keyframe_id)
+        .filter(|p| !p.is_held_out)
+    else {
+        return Ok(());
+    };
+    let view = SeedView {
+        keyframe_id,
+        image: &registered.image,
+        intrinsics: &camera.0,
+        world_from_cam: &camera.1.inverse(),
+        depth: &registered.depth,
+        rendering: rendering.as_ref(),
+        fills_gaps,
+    };
+    let mut seeds = seed::seed(
+        &view,
+        map.params.train.seeds_per_keyframe,
+        map.params.train.sh_degree,
+        rng,
+    );
+    seeds.truncate(room);
+    if !seeds.is_empty() {
+        map.splats.append(&seeds, map.engine)?;
+    }
+    Ok(())
+}
+
+/// Transparent splats move to where others are, and some are added (3DGS-MCMC).
+pub(crate) fn relocate(
+    map: &mut Parts<'_>,
+    n_trainable: usize,
+    seed: u64,
+) -> Result<(), EngineError> {
+    let active_steps = (ACTIVE_ROUNDS * n_trainable).max(MIN_ACTIVE_STEPS);
+    let settings = McmcSettings {
+        min_opacity: map.params.mcmc.min_opacity,
+        copies: match map.params.mcmc.relocation {
+            RelocationRule::Image => Relocation::Image,
+            RelocationRule::Paper => Relocation::Line,
+        },
+        max_splats: map.splats.cap(map.params, map.keyframes, map.engine),
+        growth: map.params.mcmc.growth,
+        active_steps: active_steps as u32,
+        seed: seed as u32,
+    };
+    map.engine.relocate_and_grow(&settings)?;
+    map.splats.number(map.engine);
+    Ok(())
+}
+
+/// A keyframe's camera as it is refined by now.
+pub(crate) fn camera(
+    map: &mut Parts<'_>,
+    keyframe_id: u32,
+) -> Result<Option<(Intrinsics, Rigid)>, EngineError> {
+    let Some(registered) = map.keyframes.registered().get(&keyframe_id) else {
+        return Ok(None);
+    };
+    let intrinsics = registered.intrinsics.refocused(map.engine.focal_scale()?);
+    Ok(Some((intrinsics, map.engine.poses()?[registered.view_ix])))
+}
+
+/// What the map shows to a camera; `None` for an empty map.
+pub(crate) fn shown(
+    map: &mut Parts<'_>,
+    camera: &(Intrinsics, Rigid),
+    sh_degree: u8,
+) -> Result<Option<Rendering>, EngineError> {
+    let (intrinsics, cam_from_world) = camera;
+    let is_empty = map.engine.len() == 0;
+    (!is_empty)
+        .then(|| map.engine.render(intrinsics, cam_from_world, sh_degree))
+        .transpose()
+}
+
+pub(crate) fn mask_transients(map: &mut Parts<'_>, keyframe_id: u32) -> Result<(), EngineError> {
+    if map.params.train.robust_inlier_fraction >= 1.0 {
+        return Ok(());
+    }
+    let rendering = match camera(map, keyframe_id)? {
+        Some(camera) => shown(map, &camera, map.params.train.sh_degree)?,
+        None => None,
+    };
+    let registered = map.keyframes.registered().get(&keyframe_id);
+    if let Some((registered, rendering)) = registered.zip(rendering) {
+        if registered.image.is_unloaded() {
+            return Ok(());
+        }
+        let mask = transient::mask(
+            &registered.image,
+            &rendering,
+            map.params.train.robust_inlier_fraction,
+        );
+        map.engine.set_mask(registered.view_ix, mask)?;
+    }
+    Ok(())
+}

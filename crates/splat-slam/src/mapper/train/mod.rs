@@ -1,0 +1,21 @@
+//! What the engine is asked to do and when: schedule, seeds, growth, held-out views.
+
+mod loss_curve;
+
+pub mod schedule;
+
+mod correspondences;
+
+pub(crate) mod held_out;
+
+pub mod photometric;
+
+pub mod seed;
+
+mod convergence;
+
+mod transient;
+
+pub(crate) mod grow_prune;
+
+pub(crate) mod trainer;

@@ -1,0 +1,189 @@
+//! What is trained on, in which order, and what the losses were.
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use crate::mapper::parts::Parts;
+use crate::mapper::train::convergence::Convergence;
+use crate::mapper::train::correspondences::SeenLandmarks;
+use crate::mapper::train::grow_prune;
+use crate::mapper::train::loss_curve::LossCurve;
+use crate::mapper::train::photometric::{self, FrameFit};
+use crate::mapper::train::schedule::{self, Phase, Schedule};
+use splat_engine::error::EngineError;
+use splat_engine::settings::StepSettings;
+use splat_engine::traits::Engine;
+use splat_geometry::answer::Observations;
+use splat_types::camera::Intrinsics;
+use splat_types::image::RgbImage;
+use splat_types::transform::Rigid;
+
+/// The optimisation of the map.
+#[derive(Debug)]
+pub(crate) struct Trainer {
+    seed: u64,
+    schedule: Schedule,
+    /// For views to seed from, seeds, and keyframes that take turns.
+    rng: Pcg64Mcg,
+    /// Views that are trained on, in order of arrival.
+    trainable: Vec<usize>,
+    n_steps: u64,
+    curve: LossCurve,
+    convergence: Convergence,
+    /// Index of the engine's view that frames are compared in, once one was.
+    scratch_view: Option<usize>,
+    /// Kept only where the epipolar loss has a use for matches.
+    seen: SeenLandmarks,
+}
+
+impl Trainer {
+    pub(crate) fn new(seed: u64) -> Self {
+        Self {
+            seed,
+            schedule: Schedule::new(seed),
+            rng: Pcg64Mcg::seed_from_u64(seed ^ 0x5eed_0002),
+            trainable: Vec::new(),
+            n_steps: 0,
+            curve: LossCurve::default(),
+            convergence: Convergence::default(),
+            scratch_view: None,
+            seen: SeenLandmarks::default(),
+        }
+    }
+
+    pub(crate) fn rng(&mut self) -> &mut Pcg64Mcg {
+        &mut self.rng
+    }
+
+    pub(crate) fn n_steps(&self) -> u64 {
+        self.n_steps
+    }
+
+    pub(crate) fn loss_curve(&self) -> &[(u64, f64)] {
+        self.curve.points()
+    }
+
+    /// Views to train on from now on, in order of arrival.
+    pub(crate) fn set_trainable(&mut self, views: Vec<usize>) {
+        self.trainable = views;
+        self.schedule.restart_round();
+    }
+
+    pub(crate) fn add_trainable(&mut self, view_ix: usize) {
+        self.trainable.push(view_ix);
+    }
+
+    pub(crate) fn has_converged(&self) -> bool {
+        self.convergence.is_over()
+    }
+
+    /// There is something to learn.
+    pub(crate) fn reset_convergence(&mut self) {
+        self.convergence = Convergence::default();
+    }
+
+    /// The engine is another one.
+    pub(crate) fn forget_scratch_view(&mut self) {
+        self.scratch_view = None;
+    }
+
+    pub(crate) fn forget_landmarks(&mut self) {
+        self.seen = SeenLandmarks::default();
+    }
+
+    /// Gives every view its matches with all others, with what was seen since.
+    pub(crate) fn record_observations(&mut self, map: &Parts<'_>, observations: &[Observations]) {
+        if map.params.train.epipolar_weight > 0.0 {
+            self.seen.record(observations);
+        }
+    }
+
+    pub(crate) fn match_views(&self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        self.seen.match_views(map.keyframes, map.engine)
+    }
+
+    /// One update of the optimiser; `None`: there is nothing to train on. Returns its settings.
+    pub(crate) fn step(
+        &mut self,
+        map: &mut Parts<'_>,
+        phase: Phase,
+    ) -> Result<Option<StepSettings>, EngineError> {
+        let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
+            return Ok(None);
+        };
+        let (scene_depth, pose_error) = (map.keyframes.scene_depth(), map.keyframes.pose_error());
+        let settings = schedule::settings(map.params, scene_depth, pose_error, phase);
+        map.engine.step(view_ix, &settings)?;
+        self.n_steps += 1;
+        Ok(Some(settings))
+    }
+
+    /// Notes the loss where it is due.
+    pub(crate) fn record_loss_at_interval(
+        &mut self,
+        engine: &mut dyn Engine,
+    ) -> Result<(), EngineError> {
+        if self.curve.is_due(self.n_steps) {
+            self.record_loss(engine)?;
+        }
+        Ok(())
+    }
+
+    pub(crate) fn record_loss(&mut self, engine: &mut dyn Engine) -> Result<(), EngineError> {
+        let stats = engine.take_stats()?;
+        if stats.n_steps > 0 {
+            self.curve.push(self.n_steps, stats.loss);
+            let n_views = self.trainable.len();
+            self.convergence.note(stats.loss, stats.n_steps, n_views);
+        }
+        self.curve.bound();
+        Ok(())
+    }
+
+    /// Looks at one training view: seeds where the map has a hole or is wrong, and notes what has moved in it.
+    pub(crate) fn seed_and_mask(
+        &mut self,
+        map: &mut Parts<'_>,
+        phase: Phase,
+    ) -> Result<(), EngineError> {
+        if self.trainable.is_empty() {
+            return Ok(());
+        }
+        let view_ix = self.trainable[self.rng.random_range(0..self.trainable.len())];
+        let mut registered = map.keyframes.registered().iter();
+        let id = registered
+            .find(|(_, p)| p.view_ix == view_ix)
+            .map(|(id, _)| *id);
+        if let Some(id) = id {
+            grow_prune::mask_transients(map, id)?;
+            grow_prune::seed_from(map, &mut self.rng, id, phase != Phase::Streaming)?;
+        }
+        Ok(())
+    }
+
+    pub(crate) fn seed_each(
+        &mut self,
+        map: &mut Parts<'_>,
+        ids: &[u32],
+    ) -> Result<(), EngineError> {
+        ids.iter()
+            .try_for_each(|id| grow_prune::seed_from(map, &mut self.rng, *id, false))
+    }
+
+    pub(crate) fn relocate(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        grow_prune::relocate(map, self.trainable.len(), self.seed ^ self.n_steps)
+    }
+
+    /// The pose near `world_from_cam` at which the map looks most like `image`; `None` where no pose is clearly better.
+    pub(crate) fn refine_frame(
+        &mut self,
+        map: &mut Parts<'_>,
+        image: &RgbImage,
+        intrinsics: &Intrinsics,
+        world_from_cam: &Rigid,
+    ) -> Result<Option<FrameFit>, EngineError> {
+        self.record_loss(map.engine)?;
+        let scratch_view = &mut self.scratch_view;
+        photometric::refine_frame(map, scratch_view, image, intrinsics, world_from_cam)
+    }
+}

@@ -1,0 +1,164 @@
+//! Two images and points of the first -> where those points are in the second.
+//!
+//! Pyramidal Lucas-Kanade with forward-additive Gauss-Newton (Bouguet 2000), a window of 21x21 pixels.
+
+use rayon::prelude::*;
+
+use crate::select::grey::GreyImage;
+use crate::select::window::Window;
+
+const MAX_ITERATIONS: usize = 15;
+/// A step shorter than this has converged.
+const MIN_STEP_PX: f32 = 0.01;
+
+/// An image at full size, half, quarter, and so on, with derivatives.
+#[derive(Debug, Clone)]
+pub(crate) struct Pyramid {
+    levels: Vec<Level>,
+}
+
+#[derive(Debug, Clone)]
+struct Level {
+    image: GreyImage,
+    gradients: [GreyImage; 2],
+}
+
+/// Where a point was found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Found {
+    pub at: [f32; 2],
+    /// Mean absolute difference between the windows.
+    pub error: f32,
+}
+
+impl Pyramid {
+    /// `max_level` halvings.
+    pub(crate) fn new(image: GreyImage, max_level: usize) -> Self {
+        let mut levels: Vec<Level> = Vec::with_capacity(max_level + 1);
+        let mut image = Some(image);
+        while let Some(next) = image.take() {
+            let gradients = next.gradients();
+            image = (levels.len() < max_level).then(|| next.halved());
+            levels.push(Level {
+                image: next,
+                gradients,
+            });
+        }
+        Self { levels }
+    }
+
+    /// The image at full size.
+    pub(crate) fn image(&self) -> &GreyImage {
+        &self.levels[0].image
+    }
+}
+
+/// Follows pixel positions of `from` into `to`, an image of the same size; `None` where the window has too little
+/// structure.
+pub(crate) fn optical_flow(
+    from: &Pyramid,
+    to: &Pyramid,
+    points: &[[f32; 2]],
+) -> Vec<Option<Found>> {
+    assert_eq!(from.image().size(), to.image().size(), "images of one size");
+    points
+        .par_iter()
+        .map(|point| follow(from, to, *point))
+        .collect()
+}
+
+fn follow(from: &Pyramid, to: &Pyramid, point: [f32; 2]) -> Option<Found> {
+    let mut shift = [0.0_f32; 2];
+    for (level_ix, (from, to)) in from.levels.iter().zip(&to.levels).enumerate().rev() {
+        let scale = 0.5_f32.powi(level_ix as i32);
+        let centre = point.map(|v| v * scale);
+        let window = Window::cut(&from.image, &from.gradients, centre);
+        let inverse = window.inverse_tensor()?;
+        for _ in 0..MAX_ITERATIONS {
+            let at = [centre[0] + shift[0], centre[1] + shift[1]];
+            let [d, e] = window.descent(&to.image, at);
+            let step = inverse.times([d, e]);
+            shift = [shift[0] + step[0], shift[1] + step[1]];
+            if step[0] * step[0] + step[1] * step[1] < MIN_STEP_PX * MIN_STEP_PX {
+                break;
+            }
+        }
+        if level_ix == 0 {
+            let at = [point[0] + shift[0], point[1] + shift[1]];
+            let error = window.difference(&to.image, at);
+            return Some(Found { at, error });
+        }
+        shift = shift.map(|v| v * 2.0);
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Smooth, with structure everywhere; shifted by a fraction of a pixel.
+    fn texture(shift: [f32; 2]) -> GreyImage {
+        let (width, height) = (160, 120);
+        let value = |p: usize| {
+            let (x, y) = ((p % width) as f32 - shift[0], (p / width) as f32 - shift[1]);
+            let waves = (0.31 * x).sin() * (0.23 * y).cos() + (0.11 * x + 0.17 * y).sin();
+            0.5 + 0.2 * waves
+        };
+        GreyImage {
+            width,
+            height,
+            values: (0..width * height).map(value).collect(),
+        }
+    }
+
+    fn flow(shift: [f32; 2], max_level: usize, points: &[[f32; 2]]) -> Vec<Option<Found>> {
+        let pyramid = |shift| Pyramid::new(texture(shift), max_level);
+        optical_flow(&pyramid([0.0; 2]), &pyramid(shift), points)
+    }
+
+    #[test]
+    fn a_shift_is_found_to_a_fiftieth_of_a_pixel() {
+        let points = [[40.0, 40.0], [80.3, 60.8], [120.0, 90.0]];
+        for shift in [[0.25, -0.5], [3.5, 2.25], [-7.0, 5.0]] {
+            for (point, found) in points.iter().zip(flow(shift, 2, &points)) {
+                let found = found.unwrap();
+                for axis in 0..2 {
+                    let off = found.at[axis] - point[axis] - shift[axis];
+                    assert!(off.abs() < 0.02, "{point:?} {shift:?}: off by {off}");
+                }
+                assert!(found.error < 2e-3, "{}", found.error);
+            }
+        }
+    }
+
+    #[test]
+    fn points_at_the_border_and_outside_are_followed_or_lost_without_a_fault() {
+        let points = [
+            [0.0, 0.0],
+            [159.0, 119.0],
+            [9.9, 60.0],
+            [-1.0, -1.0],
+            [1e6, 5.0],
+        ];
+        for found in flow([1.0, 0.5], 2, &points).into_iter().flatten() {
+            assert!(found.at.iter().all(|v| v.is_finite()));
+        }
+    }
+
+    #[test]
+    fn a_blank_wall_has_nothing_to_follow() {
+        let blank = || {
+            let values = vec![0.4; 64 * 48];
+            Pyramid::new(
+                GreyImage {
+                    width: 64,
+                    height: 48,
+                    values,
+                },
+                1,
+            )
+        };
+        assert_eq!(optical_flow(&blank(), &blank(), &[[30.0, 20.0]]), [None]);
+    }
+}

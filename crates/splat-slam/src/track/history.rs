@@ -1,0 +1,117 @@
+//! What was said of every frame, and what is known of it in the end.
+
+use crate::track::anchor::Anchor;
+use splat_types::time::Stamp;
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
+use splat_types::transform::Rigid;
+
+/// Frames beyond this many have no place in the trajectory: nine hours at 30 Hz, some 250 MB.
+const MAX_FRAMES: usize = 1_000_000;
+
+/// A frame of the run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameTrack {
+    pub seq: u64,
+    pub stamp: Stamp,
+    /// As it was said when the frame came.
+    pub state: TrackState,
+    pub reason: Option<LostReason>,
+    pub n_inliers: u32,
+    /// Standard deviation along and about the least certain axis: (the map's unit, degrees).
+    pub std: Option<(f32, f32)>,
+    /// `world_from_cam` as it was measured when the frame came.
+    pub live: Option<Rigid>,
+    /// The same by the last poses of the keyframes, and of frames that had no pose when they came but have one since.
+    pub refined: Option<Rigid>,
+}
+
+/// All frames, and what befell them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Tracks {
+    /// In order of time.
+    pub frames: Vec<FrameTrack>,
+    pub n_frames: u64,
+    /// Frames with a pose measured when they came.
+    pub n_tracked: u64,
+    /// Times that the tracker got lost, and was found again without a hint.
+    pub n_lost: u64,
+    pub n_relocalised: u64,
+    /// Frames whose last pose is that at which their image fits the splats best.
+    pub n_fitted: u64,
+}
+
+#[derive(Debug)]
+pub(crate) struct HistoryEntry {
+    track: FrameTrack,
+    pub(crate) anchor: Option<Anchor>,
+    /// The map was looked at to find where its image fits.
+    pub(crate) is_fitted: bool,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct History {
+    /// Up to `MAX_FRAMES`, and one more that stands for all later ones.
+    pub(crate) frames: Vec<HistoryEntry>,
+    n_frames: u64,
+    n_tracked: u64,
+    pub(crate) n_lost: u64,
+    pub(crate) n_relocalised: u64,
+}
+
+impl HistoryEntry {
+    /// What is known of the frame in the end; `refined` is its pose by the last poses of the keyframes.
+    pub(crate) fn summary(&self, refined: Option<Rigid>) -> FrameTrack {
+        FrameTrack {
+            refined,
+            ..self.track
+        }
+    }
+}
+
+impl History {
+    /// Returns the frame's number.
+    pub(crate) fn push(&mut self, frame: &TrackedFrame, anchor: Option<Anchor>) -> usize {
+        self.n_frames += 1;
+        self.n_tracked += u64::from(frame.is_measured());
+        let std = frame.pose.map(|pose| {
+            let worst = |axes: std::ops::Range<usize>| {
+                let variances = axes.map(|i| pose.covariance[i][i]);
+                variances.fold(0.0, f64::max).sqrt()
+            };
+            (worst(0..3) as f32, worst(3..6).to_degrees() as f32)
+        });
+        let measured = frame.pose.filter(|pose| !pose.is_predicted);
+        let track = FrameTrack {
+            seq: frame.seq,
+            stamp: frame.stamp,
+            state: frame.state,
+            reason: frame.reason,
+            n_inliers: frame.n_inliers as u32,
+            std,
+            live: measured.map(|pose| pose.world_from_cam),
+            refined: None,
+        };
+        if self.frames.len() > MAX_FRAMES {
+            self.frames.truncate(MAX_FRAMES);
+        }
+        self.frames.push(HistoryEntry {
+            track,
+            anchor,
+            is_fitted: false,
+        });
+        self.frames.len() - 1
+    }
+
+    pub(crate) fn into_tracks(self, mut frames: Vec<FrameTrack>) -> Tracks {
+        frames.truncate(MAX_FRAMES);
+        let fitted = self.frames.iter().filter(|frame| frame.is_fitted);
+        Tracks {
+            n_fitted: fitted.count() as u64,
+            frames,
+            n_frames: self.n_frames,
+            n_tracked: self.n_tracked,
+            n_lost: self.n_lost,
+            n_relocalised: self.n_relocalised,
+        }
+    }
+}

@@ -1,0 +1,25 @@
+//! Frames and the map's keyframes -> a pose for every frame, with covariance and state.
+
+mod pose_fit;
+
+mod motion;
+
+pub mod params;
+
+mod observation;
+
+pub mod landmarks;
+
+mod matching;
+
+mod landmark_file;
+
+mod anchor;
+
+pub mod refinement;
+
+pub mod history;
+
+mod localize;
+
+pub mod tracker;

@@ -1,0 +1,400 @@
+//! Every frame -> the camera's pose in the map, how sure it is, and whether the tracker is lost, and why.
+//!
+//! Corners of the frame are paired with landmarks of keyframes, near where the motion so far predicts them, or by their
+//! bits alone where there is no motion to go by. Reads copies of what the map knows; reports the map nothing.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use nalgebra::Matrix6;
+
+use crate::track::anchor::Anchor;
+use crate::track::history::{FrameTrack, History, Tracks};
+use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
+use crate::track::landmarks::{KeyframeView, Landmarks};
+use crate::track::localize::{Hint, Localized, Localizer};
+use crate::track::motion::Motion;
+use crate::track::observation::Observation;
+use crate::track::params::TrackParams;
+use crate::track::refinement::FrameRef;
+use splat_types::covariance::Covariance;
+use splat_types::frame::Frame;
+use splat_types::time::Stamp;
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
+use splat_types::transform::Rigid;
+
+/// Design effect before one was seen, and the share that each frame has in the mean: some 50 frames.
+const FIRST_DESIGN: f64 = 2.0;
+const DESIGN_SHARE: f64 = 0.02;
+/// Part of the time to the next frame by which a loss is declared early, so that a camera of 4 Hz says it in time as well.
+const LOOK_AHEAD: f64 = 0.7;
+/// Design effects of single frames beyond it are outliers.
+const MAX_DESIGN: f64 = 25.0;
+
+/// What was kept of a frame, and its number in the history.
+#[derive(Debug)]
+struct Waiting {
+    seen: Arc<Observation>,
+    history_ix: usize,
+}
+
+#[derive(Debug)]
+pub struct Tracker {
+    params: TrackParams,
+    landmarks: Landmarks,
+    /// Pose of every keyframe of the map, and the unit of its depths.
+    keyframes: BTreeMap<u32, (Rigid, f64)>,
+    state: TrackState,
+    motion: Option<Motion>,
+    /// Of the last measured pose.
+    anchor: Option<Anchor>,
+    /// Frames without a measured pose since the last one with.
+    n_failed: usize,
+    /// Of the frame before.
+    last_stamp: Option<Stamp>,
+    design: f64,
+    /// Where among the keyframes the search goes on.
+    searched: usize,
+    /// Frames that get a second look when the map has reached them.
+    waiting: VecDeque<Waiting>,
+    history: History,
+}
+
+impl Tracker {
+    pub fn new(params: &TrackParams) -> Self {
+        Self {
+            params: params.clone(),
+            landmarks: Landmarks::default(),
+            keyframes: BTreeMap::new(),
+            state: TrackState::Initialising,
+            motion: None,
+            anchor: None,
+            n_failed: 0,
+            last_stamp: None,
+            design: FIRST_DESIGN,
+            searched: 0,
+            waiting: VecDeque::new(),
+            history: History::default(),
+        }
+    }
+
+    /// A tracker in a map that was saved; it begins without any idea of where it is.
+    pub fn in_saved(bytes: &[u8], params: &TrackParams) -> Result<Self, String> {
+        let mut tracker = Self::new(params);
+        for held in parse_landmarks(bytes)? {
+            let pose = (held.world_from_cam, held.unit);
+            tracker.keyframes.insert(held.id, pose);
+            tracker.landmarks.held.insert(held.id, held);
+        }
+        Ok(tracker)
+    }
+
+    /// What a later run needs to find its place.
+    pub fn saved(&self) -> Result<Vec<u8>, String> {
+        landmark_bytes(&self.landmarks)
+    }
+
+    /// Keyframes that can be recognised.
+    pub fn n_keyframes(&self) -> usize {
+        self.landmarks.held.len()
+    }
+
+    pub fn state(&self) -> TrackState {
+        self.state
+    }
+
+    /// Where the camera was on the last frame with a pose, by the map of this moment.
+    pub fn last_pose(&self) -> Option<Rigid> {
+        self.motion
+            .as_ref()
+            .map(|motion| motion.cam_from_world.inverse())
+    }
+
+    /// The pose of a frame by what is known. Frames come in order of time.
+    pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
+        let seen = Arc::new(Observation::of(frame, &self.params));
+        let located = self.find(&seen);
+        let tracked = match located {
+            Ok((located, by_search)) => self.found(&seen, &located, by_search),
+            Err(reason) => self.missed(&seen, reason),
+        };
+        self.last_stamp = Some(seen.stamp);
+        let anchor = self.anchor.filter(|_| tracked.is_measured());
+        let history_ix = self.history.push(&tracked, anchor);
+        self.waiting.push_back(Waiting { seen, history_ix });
+        if self.waiting.len() > self.params.max_deferred_frames {
+            self.waiting.pop_front();
+        }
+        tracked
+    }
+
+    /// Takes over what the map says: all of its keyframes, with their poses of this moment.
+    pub fn update(&mut self, views: &[KeyframeView]) {
+        let before = self.anchor.and_then(|anchor| self.pose_by(&anchor));
+        let old_unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
+        let kept: BTreeMap<u64, &Arc<Observation>> =
+            self.waiting.iter().map(|w| (w.seen.seq, &w.seen)).collect();
+        let seen_before = |seq: u64| kept.get(&seq).map(|seen| Arc::clone(seen));
+        self.landmarks.update(views, &seen_before, &self.params);
+        self.keyframes = views
+            .iter()
+            .map(|view| {
+                let id = view.keyframe.id;
+                let held = self.landmarks.held.get(&id).map(|held| held.unit);
+                let unit = held.or(self.keyframes.get(&id).map(|(_, unit)| *unit));
+                (id, (view.world_from_cam, unit.unwrap_or(1.0)))
+            })
+            .collect();
+        let after = self.anchor.and_then(|anchor| self.pose_by(&anchor));
+        let unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
+        match (before.zip(after), self.motion.as_mut()) {
+            (Some((before, after)), Some(motion)) => {
+                let unit = unit.zip(old_unit).map_or(1.0, |(new, old)| new / old);
+                motion.moved(&(after * before.inverse()), unit);
+            }
+            // The keyframe is gone, and where the camera is with it.
+            _ => (self.motion, self.anchor) = (None, None),
+        }
+    }
+
+    /// Gives frames that the map has reached since a pose by the keyframes on both sides of them, at most `n` frames.
+    /// Returns how many were looked at.
+    pub fn retry(&mut self, n: usize) -> usize {
+        let held = self.landmarks.held.values();
+        let newest = held.map(|held| held.seen.stamp).max();
+        let mut done = 0;
+        while done < n {
+            let is_reached = |w: &Waiting| newest.is_some_and(|newest| w.seen.stamp <= newest);
+            if !self.waiting.front().is_some_and(is_reached) {
+                break;
+            }
+            let Some(waiting) = self.waiting.pop_front() else {
+                break;
+            };
+            self.retry_frame(&waiting);
+            done += 1;
+        }
+        done
+    }
+
+    /// The last word: looks at what still waits, as long as that `goes_on`, and says where every frame was by the last
+    /// poses of the keyframes.
+    pub fn finish(mut self, mut goes_on: impl FnMut() -> bool) -> Tracks {
+        while goes_on()
+            && let Some(waiting) = self.waiting.pop_front()
+        {
+            self.retry_frame(&waiting);
+        }
+        let tracks: Vec<FrameTrack> = self
+            .history
+            .frames
+            .iter()
+            .map(|f| f.summary(f.anchor.and_then(|anchor| self.pose_by(&anchor))))
+            .collect();
+        self.history.into_tracks(tracks)
+    }
+
+    /// Of the last frame; `None` where its pose was not measured.
+    pub fn placement(&self) -> Option<FrameRef> {
+        let history_ix = self.history.frames.len().checked_sub(1)?;
+        let anchor = self.history.frames[history_ix].anchor?;
+        Some(FrameRef {
+            keyframe_id: anchor.keyframe_id,
+            key_from_cam: anchor.key_from_cam,
+            history_ix,
+        })
+    }
+
+    /// Takes over a better pose of a frame, relative to the same keyframe.
+    pub fn fitted(&mut self, placement: &FrameRef, key_from_cam: Rigid) {
+        let Some(frame) = self.history.frames.get_mut(placement.history_ix) else {
+            return;
+        };
+        let Some(anchor) = frame
+            .anchor
+            .filter(|anchor| anchor.keyframe_id == placement.keyframe_id)
+        else {
+            return;
+        };
+        let better = Anchor {
+            key_from_cam,
+            ..anchor
+        };
+        (frame.anchor, frame.is_fitted) = (Some(better), true);
+        // The frame after it is looked for from there.
+        if self.anchor == Some(anchor) {
+            let poses = self.pose_by(&anchor).zip(self.pose_by(&better));
+            if let Some(((before, after), motion)) = poses.zip(self.motion.as_mut()) {
+                motion.moved(&(after * before.inverse()), 1.0);
+            }
+            self.anchor = Some(better);
+        }
+    }
+
+    fn found(&mut self, seen: &Observation, located: &Localized, by_search: bool) -> TrackedFrame {
+        let design = located.design.clamp(0.0, MAX_DESIGN);
+        self.design += DESIGN_SHARE * (design - self.design);
+        let covariance = self.localizer().covariance(located);
+        let cam_from_world = located.cam_from_world;
+        let has_jumped = by_search
+            && self.motion.as_ref().is_some_and(|motion| {
+                self.state == TrackState::Lost
+                    || motion.is_elsewhere(seen.stamp, &cam_from_world, self.scene_depth())
+            });
+        // A jump that was noticed at once was a loss all the same.
+        if has_jumped && self.state != TrackState::Lost {
+            self.history.n_lost += 1;
+        }
+        let is_new = self.motion.is_none() && self.state == TrackState::Lost;
+        self.state = if has_jumped || is_new {
+            self.history.n_relocalised += 1;
+            TrackState::Relocalised
+        } else {
+            TrackState::Tracking
+        };
+        let before = self.motion.take().filter(|_| !has_jumped);
+        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
+        self.motion = Some(motion);
+        self.anchor = Some(self.anchor_of(located));
+        self.n_failed = 0;
+        TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: None,
+            pose: Some(TrackedPose {
+                world_from_cam: cam_from_world.inverse(),
+                covariance: rows(&covariance),
+                is_predicted: false,
+            }),
+            n_inliers: located.n_inliers,
+        }
+    }
+
+    fn missed(&mut self, seen: &Observation, reason: LostReason) -> TrackedFrame {
+        self.n_failed += 1;
+        let since = self
+            .motion
+            .as_ref()
+            .map(|motion| seen.stamp.secs_since(motion.stamp));
+        let last = self.last_stamp.unwrap_or(seen.stamp);
+        let wait = seen.stamp.secs_since(last) * LOOK_AHEAD;
+        // A keyframe that is gone leaves no motion, but a tracker that was somewhere.
+        let is_late = since.is_none_or(|secs| secs + wait >= self.params.lost_secs);
+        if self.state != TrackState::Initialising && self.state != TrackState::Lost {
+            self.state = if is_late {
+                TrackState::Lost
+            } else {
+                TrackState::Tracking
+            };
+            self.history.n_lost += u64::from(is_late);
+        }
+        let depth = self.scene_depth();
+        let pose = self.motion.as_ref().map(|motion| TrackedPose {
+            world_from_cam: motion.ahead(seen.stamp).inverse(),
+            covariance: rows(&motion.covariance_ahead(seen.stamp, depth)),
+            is_predicted: true,
+        });
+        TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: Some(reason),
+            pose,
+            n_inliers: 0,
+        }
+    }
+
+    fn retry_frame(&mut self, waiting: &Waiting) {
+        let frame = &self.history.frames[waiting.history_ix];
+        let id = self.keyframe_of(waiting.seen.seq);
+        if id.is_none() && frame.is_fitted {
+            return;
+        }
+        let anchor = if let Some(id) = id {
+            // The frame is a keyframe, whose pose the map knows best.
+            Some(Anchor {
+                keyframe_id: id,
+                key_from_cam: Rigid::IDENTITY,
+                unit: self.keyframes.get(&id).map_or(1.0, |(_, unit)| *unit),
+            })
+        } else {
+            let guess = frame.anchor.and_then(|anchor| self.pose_by(&anchor));
+            self.localizer()
+                .find_again(&waiting.seen, guess)
+                .map(|located| self.anchor_of(&located))
+        };
+        if let Some(anchor) = anchor {
+            self.history.frames[waiting.history_ix].anchor = Some(anchor);
+        }
+    }
+
+    fn localizer(&self) -> Localizer<'_> {
+        Localizer {
+            landmarks: &self.landmarks,
+            params: &self.params,
+            design: self.design,
+        }
+    }
+
+    /// The pose of the newest frame, and whether it was searched for without a hint.
+    fn find(&mut self, seen: &Observation) -> Result<(Localized, bool), LostReason> {
+        let (n, start) = (self.landmarks.held.len().max(1), self.searched);
+        let hint = Hint {
+            motion: self.motion.as_ref(),
+            is_lost: self.state == TrackState::Lost,
+            n_failed: self.n_failed,
+            scene_depth: self.scene_depth(),
+            last_keyframe: self.anchor.map(|anchor| anchor.keyframe_id),
+        };
+        let (found, has_searched) = self.localizer().find(seen, &hint, start);
+        if has_searched {
+            self.searched = (start + self.params.relocalise_keyframes) % n;
+        }
+        found
+    }
+
+    fn keyframe_of(&self, seq: u64) -> Option<u32> {
+        let mut held = self.landmarks.held.values();
+        held.find(|held| held.seen.seq == seq).map(|held| held.id)
+    }
+
+    fn anchor_of(&self, located: &Localized) -> Anchor {
+        let id = located.reference;
+        let (world_from_key, unit) = self
+            .keyframes
+            .get(&id)
+            .copied()
+            .unwrap_or((Rigid::IDENTITY, 1.0));
+        Anchor {
+            keyframe_id: id,
+            key_from_cam: world_from_key.inverse() * located.cam_from_world.inverse(),
+            unit,
+        }
+    }
+
+    /// `world_from_cam` by the keyframe's pose of this moment; `None` where the map has it no more.
+    fn pose_by(&self, anchor: &Anchor) -> Option<Rigid> {
+        let (world_from_key, unit) = self.keyframes.get(&anchor.keyframe_id)?;
+        let mut key_from_cam = anchor.key_from_cam;
+        key_from_cam.translation *= unit / anchor.unit;
+        Some(*world_from_key * key_from_cam)
+    }
+
+    fn unit_of(&self, anchor: &Anchor) -> Option<f64> {
+        self.keyframes
+            .get(&anchor.keyframe_id)
+            .map(|(_, unit)| *unit)
+    }
+
+    fn scene_depth(&self) -> f64 {
+        let reference = self
+            .anchor
+            .and_then(|a| self.landmarks.held.get(&a.keyframe_id));
+        reference.map_or(1.0, crate::track::landmarks::StoredKeyframe::median_depth)
+    }
+}
+
+fn rows(matrix: &Matrix6<f64>) -> Covariance {
+    std::array::from_fn(|i| std::array::from_fn(|j| matrix[(i, j)]))
+}

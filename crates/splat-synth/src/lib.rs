@@ -1,0 +1,63 @@
+//! Synthetic scenes -> rendered frames with exact poses and depth, for demos and tests.
+
+mod geometry;
+
+mod noise;
+
+mod glyphs;
+
+mod paint;
+
+pub mod endless;
+
+mod light;
+
+mod ornaments;
+
+mod prints;
+
+mod paintings;
+
+pub mod settings;
+
+mod lens;
+
+mod options;
+
+mod surfaces;
+
+mod joinery;
+
+mod textures;
+
+mod solid;
+
+mod props;
+
+mod clutter;
+
+mod furniture;
+
+mod scene;
+
+mod lighting;
+
+mod corridor;
+
+mod hallway;
+
+mod room;
+
+mod street;
+
+mod facade;
+
+mod trajectory;
+
+pub mod take;
+
+mod odometry;
+
+pub mod record;
+
+pub mod source;

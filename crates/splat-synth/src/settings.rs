@@ -1,0 +1,100 @@
+//! What to film, and how badly.
+
+use std::path::PathBuf;
+
+/// Field of view of an ordinary webcam, and of a wide fisheye.
+pub(crate) const FOV_DEG: f64 = 66.0;
+
+#[derive(Debug, thiserror::Error)]
+pub enum SynthError {
+    #[error("{found:?} is no synthetic scene, expected room, facade, corridor or hallway")]
+    Scene { found: String },
+    #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
+    Lens { found: String },
+    #[error(
+        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, speed, seed, quality, depth, odometry"
+    )]
+    Option { key: String },
+    #[error("option {key} of a synthetic scene = {found}, expected {expected}")]
+    Value {
+        key: &'static str,
+        found: String,
+        expected: &'static str,
+    },
+    #[error("cannot {what} the recording: {reason}: {}", path.display())]
+    Write {
+        what: &'static str,
+        reason: String,
+        path: PathBuf,
+    },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SceneKind {
+    /// A furnished living room, walked round its table.
+    Room,
+    /// A house front seen from the street, walking sideways.
+    Facade,
+    /// Four corridors that close to a loop.
+    Corridor,
+    /// A straight hallway of bays that are all alike; no place is seen twice.
+    Hallway,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LensKind {
+    Pinhole,
+    /// plumb_bob with the barrel of a cheap webcam.
+    Radial,
+    /// equidistant.
+    Fisheye,
+}
+
+/// What to film, and how badly.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SynthSettings {
+    pub scene: SceneKind,
+    pub n_frames: u32,
+    pub width_px: u32,
+    pub height_px: u32,
+    /// Horizontal field of view; of the radial lens before its distortion.
+    pub fov_deg: f64,
+    pub lens: LensKind,
+    /// Standard deviation of the sensor noise in 8-bit levels.
+    pub noise: f64,
+    /// Stops up and down that the automatic exposure drifts.
+    pub exposure_drift: f64,
+    /// Share of the time between frames that the shutter is open.
+    pub blur: f64,
+    /// 1 goes round once in 120 frames.
+    pub speed: f64,
+    /// Sensor noise and the trembling of the hand follow from it; the scene is always the same.
+    pub seed: u64,
+    pub jpeg_quality: u8,
+    /// Whether recordings carry a depth topic.
+    pub depth: bool,
+    /// Share by which each step of the odometry is wrong (a standard deviation); `None`: there is none.
+    pub odometry: Option<f64>,
+}
+
+impl SynthSettings {
+    /// A clean take of one round: 120 frames of 640x480.
+    pub fn of(scene: SceneKind) -> Self {
+        Self {
+            scene,
+            n_frames: 120,
+            width_px: 640,
+            height_px: 480,
+            fov_deg: FOV_DEG,
+            lens: LensKind::Pinhole,
+            noise: 0.0,
+            exposure_drift: 0.0,
+            blur: 0.0,
+            speed: 1.0,
+            seed: 0,
+            jpeg_quality: 85,
+            depth: true,
+            odometry: None,
+        }
+    }
+}

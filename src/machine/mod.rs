@@ -1,0 +1,5 @@
+//! What the machine has: memory, processor, GPU.
+
+pub mod memory;
+
+pub mod probe;

@@ -1,0 +1,203 @@
+//! What a run is made of, and what it leaves behind.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+
+use crate::machine::probe;
+use crate::node::engines::Engines;
+use crate::node::requests::RequestHandler;
+use crate::node::stop::Stop;
+use crate::node::track_thread::TrackingSummary;
+use crate::params::params::Params;
+use splat_geometry::alignment::aligner::Aligner;
+use splat_geometry::foundation::estimator::FoundationModel;
+use splat_geometry::foundation::model::Model;
+use splat_geometry::ground_truth::model::GroundTruthModel;
+use splat_geometry::model::GeometryModel;
+use splat_geometry::sfm::estimator::Sfm;
+use splat_io::frame_source::{Source, SourceCounts};
+use splat_ros::publisher::Publisher;
+use splat_ros::transport::Transport;
+use splat_slam::mapper::mapper::Mapper;
+use splat_types::snapshot::{KeyframePose, Scale, Snapshot};
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::Rigid;
+
+/// How often a lingering node looks for Ctrl-C.
+const LINGER_TICK: Duration = Duration::from_millis(50);
+
+/// What a run is made of.
+pub struct Job {
+    pub source: Box<dyn Source>,
+    pub params: Params,
+    /// A live source drops frames rather than wait, and the map is optimised as long as frames come.
+    pub is_live: bool,
+    pub stop: Stop,
+    /// Run directory: autosaves go there, and what memory has no room for.
+    pub out: Option<PathBuf>,
+    /// The way out, where anything is to go out before the end.
+    pub publisher: Option<Arc<Publisher>>,
+    pub engines: Engines,
+}
+
+impl std::fmt::Debug for Job {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Job(live: {}, {:?})", self.is_live, self.params)
+    }
+}
+
+/// How far a run is: for progress bars and logs.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Progress {
+    pub n_keyframes: usize,
+    pub n_registered: usize,
+    pub n_splats: usize,
+    pub n_steps: u64,
+    pub steps_planned: u64,
+    /// The map changes no more.
+    pub has_ended: bool,
+}
+
+/// Wall seconds, summed over the run.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StageSecs {
+    pub wall: f64,
+    pub decode: f64,
+    pub geometry: f64,
+    pub optimise: f64,
+    pub track: f64,
+}
+
+/// What a run leaves behind.
+pub struct Outcome {
+    pub snapshot: Arc<Snapshot>,
+    pub map: Mapper,
+    pub counts: SourceCounts,
+    pub n_dropped: u64,
+    pub n_selected: usize,
+    /// Stamps of all frames that arrived, in order.
+    pub frame_stamps: Vec<Stamp>,
+    /// Poses of all frames that the tracker saw.
+    pub tracking: TrackingSummary,
+    /// Ground truth of the keyframes, where the recording has it.
+    pub truth: Vec<(Stamp, Rigid)>,
+    pub secs: StageSecs,
+    /// Seconds from the selection of a keyframe to its pose, and to the first snapshot that has it.
+    pub keyframe_to_pose_secs: Vec<f64>,
+    pub keyframe_to_snapshot_secs: Vec<f64>,
+    /// Why keyframes are missing, in the geometry model's words.
+    pub geometry_note: Option<String>,
+    /// Times that the engine was lost.
+    pub n_engine_faults: u64,
+    /// The stage that failed, and how; what was gathered before is kept.
+    pub error: Option<String>,
+    /// Somebody asked for the end.
+    pub was_stopped: bool,
+    /// Stays up for late joiners until `linger` has closed it.
+    pub publisher: Option<Arc<Publisher>>,
+    pub(crate) request_handler: RequestHandler,
+}
+
+impl Outcome {
+    /// Keyframes of this run, without those of a saved map.
+    pub fn own_poses(&self) -> &[KeyframePose] {
+        self.map.own(&self.snapshot.poses)
+    }
+}
+
+impl std::fmt::Debug for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "Outcome({} of {} keyframes, {:?})",
+            self.snapshot.poses.len(),
+            self.n_selected,
+            self.error
+        )
+    }
+}
+
+/// The geometry model that the parameters name, and where its lengths come from.
+pub(crate) fn model(
+    params: &Params,
+    truth_extent: Option<f64>,
+) -> anyhow::Result<(Box<dyn GeometryModel>, Scale)> {
+    match params.geometry.as_str() {
+        "sfm" => Ok((
+            Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
+            Scale::UP_TO_SCALE,
+        )),
+        "ground_truth" => {
+            let known = GroundTruthModel::new(
+                params.ground_truth.clone(),
+                (&params.sfm, &params.mvs),
+                truth_extent,
+                params.seed,
+            )?;
+            // Windows have units of their own, as a foundation model's have.
+            let scale = if params.ground_truth.windows {
+                Scale::UP_TO_SCALE
+            } else {
+                Scale::GIVEN
+            };
+            let known = known.in_windows(&params.align, &params.sfm)?;
+            Ok((Box::new(known), scale))
+        }
+        name => match name.strip_prefix("onnx:") {
+            Some(file) => {
+                let network = Model::open(Path::new(file), &params.onnx)?;
+                let aligner = Aligner::new(&params.align, &params.sfm, params.seed)?;
+                let free = probe::free_bytes(network.provider());
+                let foundation = FoundationModel::of(network, &params.onnx, aligner, free);
+                Ok((Box::new(foundation), Scale::UP_TO_SCALE))
+            }
+            None => bail!("{name:?} is no geometry; expected sfm, ground_truth or onnx:FILE"),
+        },
+    }
+}
+
+/// Runs a closure on a named thread (at most 15 bytes, as Linux shows them).
+pub(crate) fn spawn<T: Send + 'static>(
+    name: &'static str,
+    body: impl FnOnce() -> T + Send + 'static,
+) -> anyhow::Result<std::thread::JoinHandle<T>> {
+    std::thread::Builder::new()
+        .name(name.to_owned())
+        .spawn(body)
+        .with_context(|| format!("cannot start thread {name}"))
+}
+
+/// The way out that the parameters ask for, if any, and over `transport`.
+pub fn publisher(
+    params: &Params,
+    transport: Option<Box<dyn Transport>>,
+) -> anyhow::Result<Option<Arc<Publisher>>> {
+    let (publish, has_transport) = (&params.publish, transport.is_some());
+    if !(publish.zenoh || has_transport || !publish.record.is_empty()) {
+        return Ok(None);
+    }
+    let publisher = Publisher::open(publish)?;
+    Ok(Some(Arc::new(match transport {
+        Some(transport) => publisher.with_transport(transport),
+        None => publisher,
+    })))
+}
+
+/// Keeps the way out up for late joiners and services, then closes it; Ctrl-C cuts the wait short.
+pub fn linger(outcome: &mut Outcome, secs: f64, stop: &Stop) {
+    let Some(publisher) = outcome.publisher.take() else {
+        return;
+    };
+    let watch = Stopwatch::start();
+    while watch.secs() < secs && !stop.is_asked() {
+        // Whoever asked was reported; the files are written.
+        outcome.request_handler.serve(&mut outcome.map).ok();
+        std::thread::sleep(LINGER_TICK);
+    }
+    if let Err(e) = publisher.close() {
+        tracing::warn!("the way out did not close cleanly: {e}");
+    }
+}

@@ -1,0 +1,370 @@
+//! The stages between the queues: each is a struct with push-like methods and knows no threads.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use crate::node::autosave::Autosave;
+use crate::node::job::Progress;
+use crate::node::recovery::Recovery;
+use crate::node::refinement::RefinementWorker;
+use crate::node::requests::RequestHandler;
+use crate::node::stop::{ShutdownTimeout, Stop};
+use crate::params::params::Params;
+use splat_engine::error::EngineError;
+use splat_geometry::answer::GeometryBatch;
+use splat_ros::publisher::Publisher;
+use splat_slam::mapper::mapper::Mapper;
+use splat_slam::mapper::params::MapperParams;
+use splat_slam::mapper::train::schedule::{self, Phase};
+use splat_slam::select::selector::{Batcher, Selector};
+use splat_slam::track::landmarks::KeyframeView;
+use splat_types::frame::{Batch, Frame};
+use splat_types::snapshot::Snapshot;
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::Rigid;
+
+/// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
+const MAX_STAMPS: usize = 10_000_000;
+/// Steps between looks at the clock, the queue and the stop.
+const STEPS_AT_ONCE: u64 = 10;
+/// The same live, where a keyframe waits for them.
+const LIVE_STEPS_AT_ONCE: u64 = 2;
+/// Seconds that geometry gets to end after a stop.
+const SECS_AFTER_STOP: f64 = 0.7;
+/// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
+const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
+
+/// Frames -> batches.
+#[derive(Debug)]
+pub(crate) struct SelectStage {
+    selector: Selector,
+    batcher: Batcher,
+    pub(crate) n_selected: usize,
+    pub(crate) frame_stamps: Vec<Stamp>,
+    pub(crate) truth: Vec<(Stamp, Rigid)>,
+}
+
+/// Geometry -> the map, its steps and its snapshots.
+pub(crate) struct MapStage {
+    pub(crate) map: Mapper,
+    params: MapperParams,
+    is_live: bool,
+    stop: Stop,
+    n_frames: Option<u64>,
+    pub(crate) request_handler: RequestHandler,
+    /// Live: frames of the tracker to look at while there is nothing else to do.
+    pub(crate) fitter: Option<RefinementWorker>,
+    publisher: Option<Arc<Publisher>>,
+    /// Age of keyframes that no snapshot has shown.
+    unpublished: BTreeMap<u32, Stopwatch>,
+    pub(crate) autosave: Option<Autosave>,
+    pub(crate) recovery: Recovery,
+    since_snapshot: Stopwatch,
+    grace: ShutdownTimeout,
+    n_keyframes: usize,
+    pub(crate) optimise_secs: f64,
+    pub(crate) keyframe_to_pose_secs: Vec<f64>,
+    pub(crate) keyframe_to_snapshot_secs: Vec<f64>,
+}
+
+impl SelectStage {
+    pub(crate) fn new(params: &Params, first_id: u32) -> Self {
+        Self {
+            selector: Selector::new(params.select.clone()).counting_from(first_id),
+            batcher: Batcher::new(&params.select),
+            n_selected: 0,
+            frame_stamps: Vec::new(),
+            truth: Vec::new(),
+        }
+    }
+
+    pub(crate) fn push(&mut self, frame: Frame) -> Option<Batch> {
+        if self.frame_stamps.len() < MAX_STAMPS {
+            self.frame_stamps.push(frame.stamp);
+        }
+        let keyframe = self.selector.push(frame)?;
+        self.n_selected += 1;
+        if let Some(truth) = keyframe.frame.truth {
+            self.truth.push((keyframe.frame.stamp, truth));
+        }
+        self.batcher.push(keyframe)
+    }
+
+    /// Keyframes that were in no batch so far.
+    pub(crate) fn n_new(&self) -> usize {
+        self.batcher.n_new()
+    }
+
+    /// A batch that is not full; `None` when every keyframe has been in one.
+    pub(crate) fn finish(&mut self) -> Option<Batch> {
+        self.batcher.finish()
+    }
+}
+
+impl MapStage {
+    pub(crate) fn new(
+        map: Mapper,
+        params: &Params,
+        (is_live, n_frames): (bool, Option<u64>),
+        recovery: Recovery,
+        publisher: Option<Arc<Publisher>>,
+    ) -> Self {
+        let calls = publisher
+            .as_ref()
+            .and_then(|publisher| publisher.take_calls());
+        let stop = recovery.stop.clone();
+        Self {
+            map,
+            params: params.mapper(),
+            is_live,
+            request_handler: RequestHandler::new(calls, &params.track, stop.clone()),
+            grace: ShutdownTimeout::new(stop.clone()),
+            stop,
+            n_frames,
+            fitter: None,
+            publisher,
+            unpublished: BTreeMap::new(),
+            autosave: None,
+            recovery,
+            since_snapshot: Stopwatch::start(),
+            n_keyframes: 0,
+            optimise_secs: 0.0,
+            keyframe_to_pose_secs: Vec::new(),
+            keyframe_to_snapshot_secs: Vec::new(),
+        }
+    }
+
+    /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end.
+    pub(crate) fn add(
+        &mut self,
+        batch: Option<&Batch>,
+        geometry: &GeometryBatch,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) {
+        let newest = batch
+            .and_then(|b| b.keyframes.last())
+            .map(|k| k.frame.seq + 1);
+        let progress = self
+            .n_frames
+            .zip(newest)
+            .map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
+        for keyframe in batch.iter().flat_map(|b| &b.keyframes) {
+            self.n_keyframes = self.n_keyframes.max(keyframe.id as usize + 1);
+            if !self.map.has_keyframe(keyframe.id) {
+                self.unpublished.insert(keyframe.id, keyframe.age);
+            }
+        }
+        let watch = Stopwatch::start();
+        let fresh = self.on_map(|map| map.add(batch, geometry, progress));
+        for id in fresh.unwrap_or_default() {
+            if let Some(age) = self.unpublished.get(&id) {
+                let secs = age.secs();
+                tracing::debug!("keyframe {id} has its pose after {secs:.2} s");
+                self.keyframe_to_pose_secs.push(secs);
+                if let Some(publisher) = &self.publisher {
+                    publisher.note(|status| status.keyframe_to_pose.note(secs));
+                }
+            }
+        }
+        self.optimise_secs += watch.secs();
+        self.note();
+        if !self.is_live {
+            let due = schedule::due(&self.params, progress.unwrap_or(0.0));
+            self.step_until(due, publish);
+        }
+    }
+
+    /// Live: a few steps, if any are left to make. Returns whether some were made.
+    pub(crate) fn step_while_waiting(
+        &mut self,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) -> bool {
+        if self.map.is_settled() {
+            return false;
+        }
+        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
+        let target = (self.map.n_steps() + LIVE_STEPS_AT_ONCE).min(cap);
+        let before = self.map.n_steps();
+        self.step_until(target, publish);
+        self.map.n_steps() > before
+    }
+
+    /// The steps after the last keyframe, the poses of held-out views, and the last snapshot.
+    pub(crate) fn finish(
+        &mut self,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) -> Arc<Snapshot> {
+        let watch = Stopwatch::start();
+        let (first, last) = (self.map.n_steps(), self.params.train.steps);
+        let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
+        self.make_steps(last, &phase, publish);
+        // Splats as they were seeded say less of a pose than the geometry that seeded them.
+        if self.map.n_steps() > 0 && !self.stop.is_asked() {
+            self.on_map(Mapper::refine_held_out);
+        }
+        self.optimise_secs += watch.secs();
+        // The last map file must not be overtaken by an older one.
+        self.autosave = None;
+        // After a fault that ends mapping: the last that was read before it.
+        let snapshot = self.snapshot();
+        let snapshot = snapshot.unwrap_or_else(|| self.map.last_snapshot());
+        self.note();
+        let last = Progress {
+            has_ended: true,
+            ..self.progress()
+        };
+        publish(Arc::clone(&snapshot), last);
+        snapshot
+    }
+
+    /// Calls from outside and frames of the tracker, while nothing else is to be done.
+    pub(crate) fn serve(&mut self) {
+        let served = self.request_handler.serve(&mut self.map);
+        self.react(served);
+        if let Some(fitter) = &self.fitter {
+            let fitted = fitter.fit_one(&mut self.map);
+            self.react(fitted);
+        }
+    }
+
+    /// All keyframes as they stand; after a fault that ends mapping, as they last stood.
+    pub(crate) fn keyframe_views(&mut self) -> Vec<KeyframeView> {
+        let views = self.on_map(Mapper::keyframe_views);
+        views.unwrap_or_else(|| self.map.last_keyframe_views())
+    }
+
+    /// Works on the map; where the device is lost, again from the last good state. `None` once mapping has ended.
+    fn on_map<T>(
+        &mut self,
+        mut work: impl FnMut(&mut Mapper) -> Result<T, EngineError>,
+    ) -> Option<T> {
+        while self.recovery.error.is_none() {
+            let done = work(&mut self.map);
+            if let Some(done) = self.react(done) {
+                return Some(done);
+            }
+        }
+        None
+    }
+
+    /// A fault is an event: the map goes on with another engine, or mapping ends.
+    fn react<T>(&mut self, done: Result<T, EngineError>) -> Option<T> {
+        let error = match done {
+            Ok(done) => return Some(done),
+            Err(error) => error,
+        };
+        if self.recovery.error.is_none() {
+            self.note_recovery(Some(error.to_string()));
+            self.recovery.recover(&mut self.map, &error);
+            self.note_recovery(None);
+        }
+        None
+    }
+
+    fn note_recovery(&self, recovering: Option<String>) {
+        if let Some(publisher) = &self.publisher {
+            publisher.note(|status| status.recovering = recovering);
+        }
+    }
+
+    /// After a stop, geometry gets a moment for the batch that it is at, and no more: a network can take minutes.
+    pub(crate) fn timed_out(&mut self) -> bool {
+        self.grace.is_over(SECS_AFTER_STOP)
+    }
+
+    /// Writes the map's part of the status.
+    fn note(&self) {
+        let Some(publisher) = &self.publisher else {
+            return;
+        };
+        let (map, optimise_secs) = (&self.map, self.optimise_secs);
+        publisher.note(|status| {
+            status.n_registered = map.n_keyframes() as u64;
+            status.n_submaps = map.submaps().len() as u64;
+            status.n_splats = map.n_splats() as u64;
+            status.n_steps = map.n_steps();
+            status.gpu_bytes = map.peak_gpu_bytes();
+            if optimise_secs > 0.0 {
+                status.steps_per_s = map.n_steps() as f64 / optimise_secs;
+            }
+        });
+    }
+
+    fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+        let watch = Stopwatch::start();
+        self.make_steps(target, &|_| Phase::Streaming, publish);
+        self.optimise_secs += watch.secs();
+        self.snapshot_if_due(publish);
+    }
+
+    /// Steps up to `target`, as long as nobody asks to stop; `phase` of the steps made so far.
+    fn make_steps(
+        &mut self,
+        target: u64,
+        phase: &dyn Fn(u64) -> Phase,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) {
+        while self.map.n_steps() < target && !self.stop.is_asked() {
+            let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
+            let phase = phase(self.map.n_steps());
+            let made = self.map.step(n, phase);
+            // After a fault the count of steps says how many are left.
+            if self.react(made) == Some(0) || self.recovery.error.is_some() {
+                break;
+            }
+            let served = self.request_handler.serve(&mut self.map);
+            self.react(served);
+            self.snapshot_if_due(publish);
+        }
+    }
+
+    fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+        let is_due = self.since_snapshot.secs() >= self.params.map.snapshot_secs;
+        if is_due
+            && self.map.n_splats() > 0
+            && let Some(snapshot) = self.snapshot()
+        {
+            publish(snapshot, self.progress());
+        }
+        if self.recovery.error.is_none() {
+            let autosave = self.autosave.as_mut();
+            let saved = Autosave::save_if_due(autosave, &mut self.map, &mut self.request_handler);
+            self.react(saved);
+        }
+    }
+
+    /// `None` once mapping has ended.
+    fn snapshot(&mut self) -> Option<Arc<Snapshot>> {
+        self.note();
+        if let (Some(moved), Some(publisher)) = (self.map.take_correction(), &self.publisher) {
+            publisher.queue_correction(moved);
+        }
+        let snapshot = self.on_map(Mapper::snapshot)?;
+        self.since_snapshot = Stopwatch::start();
+        for pose in &snapshot.poses {
+            if let Some(age) = self.unpublished.remove(&pose.keyframe_id) {
+                self.keyframe_to_snapshot_secs.push(age.secs());
+            }
+        }
+        // Keyframes that never get a pose must not pile up.
+        while self.unpublished.len() > splat_slam::mapper::mapper::MAX_WAITING {
+            self.unpublished.pop_first();
+        }
+        Some(snapshot)
+    }
+
+    fn progress(&self) -> Progress {
+        Progress {
+            n_keyframes: self.n_keyframes,
+            n_registered: self.map.n_keyframes(),
+            n_splats: self.map.n_splats(),
+            n_steps: self.map.n_steps(),
+            steps_planned: if self.is_live {
+                0
+            } else {
+                self.params.train.steps
+            },
+            has_ended: false,
+        }
+    }
+}

@@ -1,0 +1,69 @@
+//! A job -> the stages that hold a map: begun anew, or gone on with from a saved one.
+
+use std::path::Path;
+use std::sync::mpsc::Receiver as Calls;
+
+use anyhow::anyhow;
+
+use crate::node::autosave::Autosave;
+use crate::node::job::Job;
+use crate::node::map_stage::MapStage;
+use crate::node::page_file::PageFile;
+use crate::node::recovery::Recovery;
+use crate::node::stop::ShutdownTimeout;
+use crate::node::track_thread::TrackStage;
+use splat_io::queue::{WhenFull, queue};
+use splat_ros::service_server::ServiceCall;
+use splat_slam::mapper::map_file::checkpoint;
+use splat_slam::mapper::mapper::Mapper;
+use splat_types::snapshot::Scale;
+
+/// The map, who tracks by it, and the first id of keyframes that come.
+pub(crate) struct Opened {
+    pub(crate) map: MapStage,
+    pub(crate) track: TrackStage,
+    pub(crate) first_id: u32,
+}
+
+pub(crate) fn open(
+    job: &Job,
+    scale: Scale,
+    calls: Option<Calls<ServiceCall>>,
+) -> anyhow::Result<Opened> {
+    let params = &job.params;
+    let engine = job.engines.best(params.backend, params.deterministic)?;
+    let pages = PageFile::new(job.out.as_deref(), params.map.max_page_file_mib << 20);
+    let mut map = Mapper::new(params.mapper(), params.seed, scale, engine)
+        .measuring_scale(&params.scale)
+        .paging_to(Box::new(pages));
+    let mut track = TrackStage::new(&params.track, job.is_live);
+    track.grace = ShutdownTimeout::new(job.stop.clone());
+    if !params.map.resume.is_empty() {
+        let saved = checkpoint::read(Path::new(&params.map.resume))?;
+        track.begin_in(&saved.landmarks, &params.track)?;
+        map = map
+            .resume_report(saved, &params.track)
+            .map_err(|reason| anyhow!("cannot go on from {}: {reason}", params.map.resume))?;
+    }
+    let first_id = map.first_id();
+    let n_frames = job.source.len_hint().filter(|n| *n > 0);
+    let mut map = MapStage::new(
+        map,
+        params,
+        (job.is_live, n_frames),
+        Recovery::new(params, job.is_live, job.engines.clone(), job.stop.clone()),
+        job.publisher.clone(),
+    );
+    map.request_handler.keep_calls(calls);
+    map.autosave = Autosave::start(job.out.as_deref(), params.map.autosave_secs)?;
+    if map.autosave.is_some() || job.publisher.is_some() {
+        let (reported, landmarks) = queue("landmarks", 1, WhenFull::DropOldest);
+        track.save_landmarks_to(params.map.autosave_secs, reported);
+        map.request_handler.receive_landmarks(landmarks);
+    }
+    Ok(Opened {
+        map,
+        track,
+        first_id,
+    })
+}

@@ -1,0 +1,9 @@
+//! Figures -> report.html.
+
+pub mod charts;
+
+pub mod comparisons;
+
+pub mod pose_quality;
+
+pub mod html;
