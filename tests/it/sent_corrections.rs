@@ -100,6 +100,7 @@ fn a_correction_goes_out_once_with_the_first_snapshot_that_shows_it() {
 fn corrections_of_snapshots_that_nobody_saw_are_sent_as_one() {
     let (publisher, sent) = publisher();
     publisher.publish(&snapshot(1, 0)).unwrap();
+    assert!(corrections(&sent).is_empty());
     publisher.queue_correction(moved(1, 2));
     publisher.queue_correction(moved(2, 3));
     publisher.publish(&snapshot(3, 2)).unwrap();

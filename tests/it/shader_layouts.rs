@@ -273,7 +273,7 @@ fn shared_numbers_are_those_of_the_host() {
         ("FLAG_POSE_DIRECT", types::FLAG_POSE_DIRECT),
         ("FLAG_POSE_SHARED", types::FLAG_POSE_SHARED),
         ("FLAG_DEPTH", types::FLAG_DEPTH),
-        ("FLAG_REFINER", types::FLAG_POSE_NETWORK),
+        ("FLAG_POSE_NETWORK", types::FLAG_POSE_NETWORK),
     ] {
         check("update_view", constant, u64::from(expected));
     }
