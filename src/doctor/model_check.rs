@@ -16,7 +16,7 @@ use splat_types::time::Stopwatch;
 const PARITY_FRAMES: usize = 2;
 const MIB: f64 = (1 << 20) as f64;
 
-/// What `splat-mapper model check` says.
+/// What `splat-mapper model check` found. Many fields: the keys of what it prints as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Report {
     pub model: String,

@@ -14,6 +14,7 @@ use splat_types::snapshot;
 
 const MAX_FILE_BYTES: u64 = 1 << 26;
 
+/// report.json. Many fields: its keys, which scripts outside read.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// Of the program that wrote this.

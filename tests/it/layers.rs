@@ -51,7 +51,7 @@ struct SourceFile {
 }
 
 /// The root of the sources of each crate, the node's last.
-fn roots() -> Vec<(String, PathBuf)> {
+pub fn roots() -> Vec<(String, PathBuf)> {
     let of_crate = |(name, _): &(&str, _)| {
         let root = Path::new("crates").join(name).join("src");
         ((*name).to_owned(), root)
@@ -61,7 +61,7 @@ fn roots() -> Vec<(String, PathBuf)> {
     roots
 }
 
-fn rust_files(folder: &Path) -> Vec<PathBuf> {
+pub fn rust_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();

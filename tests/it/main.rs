@@ -60,6 +60,8 @@ mod sfm_batches;
 mod sfm_lenses;
 mod shader_layouts;
 mod shaders;
+mod sizes;
+mod slam;
 mod source_errors;
 mod sources;
 mod synthetic;

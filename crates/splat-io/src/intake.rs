@@ -4,9 +4,6 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fast_image_resize::images::{Image as ResizeImage, ImageRef};
-use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
-
 use crate::calibration::lens_for_size;
 use crate::frame_source::SourceCounts;
 use crate::params::SourceParams;
@@ -16,7 +13,7 @@ use splat_image::undistort::Undistorter;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::depth::DepthMap;
 use splat_types::frame::Frame;
-use splat_types::image::RgbImage;
+use splat_types::image::{Filter, Resampler, RgbImage};
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
 
@@ -57,7 +54,7 @@ pub struct Intake {
     /// The lens of the images as they arrive; `None` while nothing usable is known.
     lens: Option<CameraModel>,
     working: Option<Working>,
-    resizer: Resizer,
+    resampler: Resampler,
     pool: Pool,
     last_stamp: Option<Stamp>,
     n_frames: u64,
@@ -72,7 +69,7 @@ impl Intake {
             params: params.clone(),
             lens,
             working: None,
-            resizer: Resizer::new(),
+            resampler: Resampler::default(),
             pool: Pool::default(),
             last_stamp: None,
             n_frames: 0,
@@ -271,21 +268,8 @@ impl Intake {
         let n_bytes = 3 * size.0 as usize * size.1 as usize;
         let mut out = self.pool.spare_of(n_bytes);
         resize(&mut out, size.0, size.1);
-        let source = ImageRef::new(
-            image.width_px,
-            image.height_px,
-            &image.pixels,
-            PixelType::U8x3,
-        )
-        .expect("three bytes per pixel");
-        let mut target =
-            ResizeImage::from_slice_u8(size.0, size.1, &mut out.pixels, PixelType::U8x3)
-                .expect("three bytes per pixel");
         // A box filter would move edges by up to half a pixel at ratios that are not whole.
-        let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::Lanczos3));
-        self.resizer
-            .resize(&source, &mut target, &options)
-            .expect("both images are U8x3");
+        self.resampler.resize(&image, &mut out, Filter::Lanczos3);
         self.pool.take_back(image);
         out
     }

@@ -33,12 +33,18 @@ struct Waiting {
     payload: Vec<u8>,
 }
 
+/// The topics that are read.
+#[derive(Debug)]
+struct ImageTopics {
+    image: String,
+    is_compressed: bool,
+    depth: Option<String>,
+}
+
 #[derive(Debug)]
 pub struct McapSource {
     bag: Bag,
-    image_topic: String,
-    is_compressed: bool,
-    depth_topic: Option<String>,
+    topics: ImageTopics,
     truth: GroundTruth,
     odometry: Odometry,
     truth_within_nanos: i64,
@@ -87,13 +93,15 @@ impl McapSource {
         );
         Ok(Self {
             bag: Bag::new(files),
-            is_compressed,
-            depth_topic,
             truth_within_nanos,
             n_images,
             odometry: odometry_of(&mut survey, &image_topic, params),
             truth: truth_of(survey, &image_topic, params),
-            image_topic,
+            topics: ImageTopics {
+                image: image_topic,
+                is_compressed,
+                depth: depth_topic,
+            },
             max_frames: params.max_frames,
             images: VecDeque::new(),
             depths: VecDeque::new(),
@@ -117,9 +125,9 @@ impl McapSource {
                 return;
             }
         };
-        let waiting = if message.channel.topic == self.image_topic {
+        let waiting = if message.channel.topic == self.topics.image {
             &mut self.images
-        } else if Some(&message.channel.topic) == self.depth_topic.as_ref() {
+        } else if Some(&message.channel.topic) == self.topics.depth.as_ref() {
             &mut self.depths
         } else {
             return;
@@ -141,7 +149,7 @@ impl McapSource {
         let stamp = self.images.front()?.stamp;
         let newest_depth = self.depths.iter().filter_map(|depth| depth.stamp).max();
         let is_ready = self.is_read
-            || self.depth_topic.is_none()
+            || self.topics.depth.is_none()
             || stamp.is_none()
             || newest_depth >= stamp
             || self.images.len() > MAX_AHEAD
@@ -161,7 +169,12 @@ impl McapSource {
         let arrival = self.intake.arrive(stamp)?;
         let mut image = self.intake.spare();
         let jpeg = &mut self.jpeg;
-        match decode_into(&waiting.payload, self.is_compressed, jpeg, &mut image) {
+        match decode_into(
+            &waiting.payload,
+            self.topics.is_compressed,
+            jpeg,
+            &mut image,
+        ) {
             Ok(()) => self.frame_with(arrival, image),
             Err(reason) => {
                 self.intake.undecodable(arrival.seq, &reason);

@@ -5,3 +5,5 @@ pub mod select;
 pub mod track;
 
 pub mod mapper;
+
+pub mod slam;

@@ -50,7 +50,7 @@ pub enum LensKind {
     Fisheye,
 }
 
-/// What to film, and how badly.
+/// What to film, and how badly. Many fields: the options of a `synthetic:` input.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SynthSettings {
     pub scene: SceneKind,

@@ -103,25 +103,19 @@ pub fn working_size(width_px: u32, height_px: u32, max_side: u32) -> (u32, u32) 
 
 /// `None` where one of the sizes is zero.
 pub(crate) fn resized(full: &Grey, width: u32, height: u32) -> Option<Grey> {
-    let source = fir::images::ImageRef::new(
-        full.width as u32,
-        full.height as u32,
-        bytemuck::cast_slice(&full.pixels),
-        fir::PixelType::F32,
-    )
-    .ok()?;
+    use fir::images::{TypedImage, TypedImageRef};
+    use fir::pixels::F32;
+    let bytes = bytemuck::cast_slice(&full.pixels);
+    let (full_width, full_height) = (full.width as u32, full.height as u32);
+    let source = TypedImageRef::<F32>::from_buffer(full_width, full_height, bytes).ok()?;
     let mut pixels = vec![0.0_f32; width as usize * height as usize];
-    let mut target = fir::images::Image::from_slice_u8(
-        width,
-        height,
-        bytemuck::cast_slice_mut(&mut pixels),
-        fir::PixelType::F32,
-    )
-    .ok()?;
+    let bytes = bytemuck::cast_slice_mut(&mut pixels);
+    let mut target = TypedImage::<F32>::from_buffer(width, height, bytes).ok()?;
     let options =
         fir::ResizeOptions::new().resize_alg(fir::ResizeAlg::Convolution(fir::FilterType::Hamming));
+    // Typed: `Resizer::resize` would compile the kernels of all thirteen pixel types into this crate.
     fir::Resizer::new()
-        .resize(&source, &mut target, &options)
+        .resize_typed(&source, &mut target, &options)
         .ok()?;
     Some(Grey {
         width: width as usize,

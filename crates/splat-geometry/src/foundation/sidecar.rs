@@ -87,7 +87,8 @@ pub enum Attention {
     Fused,
 }
 
-/// What the JSON file says. Keys that are not here are no fault: later exports may say more.
+/// The JSON file beside a model. Keys that are not here are no fault: later exports may have more. Many fields: those
+/// are the keys.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct Sidecar {
     pub family: Family,

@@ -60,6 +60,29 @@ pub struct Tally {
     pub interruptions: u64,
 }
 
+/// How long a camera has given nothing, and what was done about it.
+struct Silence {
+    /// Since the last good image, or since it was opened.
+    since_capture: Stopwatch,
+    since_attempt: Stopwatch,
+    only_damaged: bool,
+    /// Factor of the time that an open camera may be silent.
+    patience: f64,
+    outage: Option<Stopwatch>,
+}
+
+impl Silence {
+    fn none() -> Self {
+        Self {
+            since_capture: Stopwatch::start(),
+            since_attempt: Stopwatch::start(),
+            only_damaged: false,
+            patience: 1.0,
+            outage: None,
+        }
+    }
+}
+
 pub struct Live {
     name: String,
     open: Opener,
@@ -67,12 +90,7 @@ pub struct Live {
     layout: Layout,
     stamps: StampMap,
     last_sequence: Option<u32>,
-    /// Since the last good image, or since it was opened.
-    since_capture: Stopwatch,
-    since_attempt: Stopwatch,
-    only_damaged: bool,
-    patience: f64,
-    outage: Option<Stopwatch>,
+    silence: Silence,
     tally: Tally,
     health: CameraStatusWatch,
     asked: Arc<AtomicBool>,
@@ -99,11 +117,7 @@ impl Live {
             layout,
             stamps,
             last_sequence: None,
-            since_capture: Stopwatch::start(),
-            since_attempt: Stopwatch::start(),
-            only_damaged: false,
-            patience: 1.0,
-            outage: None,
+            silence: Silence::none(),
             tally: Tally::default(),
             health,
             asked: Arc::default(),
@@ -171,7 +185,7 @@ impl Live {
                     self.last_sequence = captured.sequence;
                     if captured.is_damaged {
                         self.tally.damaged += 1;
-                        self.only_damaged = true;
+                        self.silence.only_damaged = true;
                     } else {
                         let stamp = self.stamps.stamp(captured.taken_nanos, &captured.now);
                         let taken = take(&self.layout, stamp, captured.bytes);
@@ -190,10 +204,10 @@ impl Live {
     }
 
     fn went_well(&mut self) {
-        self.since_capture = Stopwatch::start();
-        self.only_damaged = false;
-        self.patience = 1.0;
-        if let Some(outage) = self.outage.take() {
+        self.silence.since_capture = Stopwatch::start();
+        self.silence.only_damaged = false;
+        self.silence.patience = 1.0;
+        if let Some(outage) = self.silence.outage.take() {
             tracing::warn!(
                 "the camera is back after {:.1} s: {}",
                 outage.secs(),
@@ -207,15 +221,15 @@ impl Live {
 
     fn check_silence(&mut self) {
         let interval = self.layout.rate_hz.map_or(0.0, |hz| 1.0 / hz.max(1e-3));
-        let allowed = SILENT_SECS.max(SILENT_IMAGES * interval) * self.patience;
-        let silent = self.since_capture.secs();
+        let allowed = SILENT_SECS.max(SILENT_IMAGES * interval) * self.silence.patience;
+        let silent = self.silence.since_capture.secs();
         if silent > allowed {
-            let what = if self.only_damaged {
+            let what = if self.silence.only_damaged {
                 "only damaged images"
             } else {
                 "no image"
             };
-            self.patience = (2.0 * self.patience).min(MAX_PATIENCE);
+            self.silence.patience = (2.0 * self.silence.patience).min(MAX_PATIENCE);
             let name = &self.name;
             self.lose(format!("{what} for {silent:.1} s, it may hang: {name}"));
         }
@@ -226,9 +240,9 @@ impl Live {
         self.camera = None;
         self.last_sequence = None;
         // At once, then at intervals.
-        self.since_attempt = Stopwatch::start();
-        if self.outage.is_none() {
-            self.outage = Some(Stopwatch::start());
+        self.silence.since_attempt = Stopwatch::start();
+        if self.silence.outage.is_none() {
+            self.silence.outage = Some(Stopwatch::start());
             self.tally.interruptions += 1;
             self.health.lock().n_interruptions += 1;
         }
@@ -245,7 +259,7 @@ impl Live {
     }
 
     fn try_again(&mut self) {
-        let wait = RETRY.saturating_sub(self.since_attempt.elapsed());
+        let wait = RETRY.saturating_sub(self.silence.since_attempt.elapsed());
         if !wait.is_zero() {
             std::thread::sleep(wait.min(TICK));
             return;
@@ -254,12 +268,12 @@ impl Live {
             Ok(camera) => {
                 self.layout = camera.layout();
                 self.camera = Some(camera);
-                self.since_capture = Stopwatch::start();
-                self.only_damaged = false;
+                self.silence.since_capture = Stopwatch::start();
+                self.silence.only_damaged = false;
             }
             Err(error) => self.report(error.to_string()),
         }
-        self.since_attempt = Stopwatch::start();
+        self.silence.since_attempt = Stopwatch::start();
     }
 }
 

@@ -35,11 +35,13 @@ pub(crate) fn scale_depths(
     let map_poses = engine.poses()?;
     let focal_factor = engine.focal_scale()?;
     for registered in keyframes.values_mut() {
-        if registered.n_depth_looks >= N_LOOKS || registered.is_held_out || !registered.home.is_here
+        if registered.depth_fit.n_looks >= N_LOOKS
+            || registered.is_held_out
+            || !registered.home.is_here
         {
             continue;
         }
-        registered.n_depth_looks += 1;
+        registered.depth_fit.n_looks += 1;
         let intrinsics = registered.intrinsics.refocused(focal_factor);
         let pose = &map_poses[registered.view_ix];
         let rendering = engine.render(&intrinsics, pose, 0)?;
@@ -57,7 +59,7 @@ pub(crate) fn scale_depths(
 
 fn rescale_depth(registered: &mut RegisteredKeyframe, factor: f64) {
     registered.depth = Arc::new(rescaled(&registered.depth, factor));
-    registered.depth_factor *= factor;
+    registered.depth_fit.factor *= factor;
     registered.median_depth = registered.depth.median();
 }
 

@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use crate::mapper::cameras::Cameras;
 use crate::mapper::depth_scale::scale_depths;
-use crate::mapper::keyframes::registered::RegisteredKeyframe;
+use crate::mapper::keyframes::registered::{DepthFit, RegisteredKeyframe};
 use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::keyframes::store::{KeyframeStore, ROTATE_EVERY};
 use crate::mapper::keyframes::tracker_views::views_of;
@@ -51,7 +51,7 @@ const PRUNE_EVERY: u64 = 400;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to converge.
 const LAST_RESEED: f32 = 0.6;
 
-/// All splats and poses, and the engine that improves them. More than 30 methods: it is the one face of the map, and each
+/// All splats and poses, and the engine that improves them. Many methods: it is the one face of the map, and each
 /// of its users needs a few.
 pub struct Mapper {
     params: MapperParams,
@@ -434,8 +434,8 @@ impl Mapper {
         let (mut fresh, mut deepened) = (Vec::new(), Vec::new());
         for view in views {
             let given = self.keyframes.registered().get(&view.keyframe_id);
-            let factor =
-                world_from_submap.scale * given.map_or(1.0, |registered| registered.depth_factor);
+            let factor = world_from_submap.scale
+                * given.map_or(1.0, |registered| registered.depth_fit.factor);
             let depth = Arc::new(rescaled(&view.depth, factor));
             let median_depth = depth.median();
             if self.has_keyframe(view.keyframe_id) {
@@ -472,9 +472,7 @@ impl Mapper {
                         lens: view.lens,
                         depth,
                         median_depth,
-                        depth_factor: 1.0,
-                        n_depth_looks: 0,
-                        ratios: None,
+                        depth_fit: DepthFit::default(),
                         health: view.health,
                         is_held_out,
                         home: Residency::here(),

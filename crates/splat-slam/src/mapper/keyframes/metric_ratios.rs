@@ -81,7 +81,7 @@ fn height_above_floor(depth: &DepthMap, lens: &Intrinsics, seed: u64) -> Option<
 /// Logarithms of metres per map unit by this keyframe's own depth: as a depth camera has it, and over the floor.
 pub(crate) fn measure(registered: &mut RegisteredKeyframe, params: &ScaleParams) {
     let units = &registered.depth;
-    if registered.ratios.is_some() || units.width_px == 0 {
+    if registered.depth_fit.log_metres.is_some() || units.width_px == 0 {
         return;
     }
     let by_depth = registered.keyframe.frame.sensor_depth.as_ref();
@@ -96,12 +96,13 @@ pub(crate) fn measure(registered: &mut RegisteredKeyframe, params: &ScaleParams)
         })
         .flatten()
         .map(|units| (params.camera_height / units).ln());
-    let unscaled = registered.depth_factor.ln();
-    registered.ratios = Some([by_depth, by_height].map(|log| log.map(|l| l + unscaled)));
+    let unscaled = registered.depth_fit.factor.ln();
+    registered.depth_fit.log_metres =
+        Some([by_depth, by_height].map(|log| log.map(|l| l + unscaled)));
 }
 
 pub(crate) fn ratio(registered: &RegisteredKeyframe, which: usize) -> Option<f64> {
-    Some(registered.ratios?[which]? - registered.depth_factor.ln())
+    Some(registered.depth_fit.log_metres?[which]? - registered.depth_fit.factor.ln())
 }
 
 #[cfg(test)]

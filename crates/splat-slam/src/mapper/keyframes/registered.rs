@@ -10,7 +10,29 @@ use splat_types::frame::Keyframe;
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
 
-/// A keyframe with a place in the map.
+/// How the model's depth of a keyframe relates to the map and to metres.
+#[derive(Debug, Clone, Copy)]
+pub struct DepthFit {
+    /// The map's depth over the model's, beyond the scale of the whole submap.
+    pub factor: f64,
+    /// How often the map was asked.
+    pub n_looks: u8,
+    /// Logarithms of metres per unit of the model's depth, by depth images and by the floor; `None` before it was
+    /// looked at.
+    pub log_metres: Option<[Option<f64>; 2]>,
+}
+
+impl Default for DepthFit {
+    fn default() -> Self {
+        Self {
+            factor: 1.0,
+            n_looks: 0,
+            log_metres: None,
+        }
+    }
+}
+
+/// A keyframe that has a pose in the map.
 #[derive(Debug, Clone)]
 pub struct RegisteredKeyframe {
     pub keyframe: Arc<Keyframe>,
@@ -26,12 +48,7 @@ pub struct RegisteredKeyframe {
     /// In map units, and its median.
     pub depth: Arc<DepthMap>,
     pub median_depth: Option<f32>,
-    /// What the map made of the model's depth, and how often it was asked.
-    pub depth_factor: f64,
-    pub n_depth_looks: u8,
-    /// Logarithms of metres per unit of the model's depth, by depth images and by the floor; `None` before it was
-    /// looked at.
-    pub ratios: Option<[Option<f64>; 2]>,
+    pub depth_fit: DepthFit,
     pub health: PoseQuality,
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,

@@ -36,7 +36,7 @@ const VIEWS_SHARE: usize = 2;
 pub(crate) const ROTATE_EVERY: u64 = 50;
 const N_PER_ROTATION: usize = 2;
 
-/// Everything that has come and may still be used, by keyframe id. More than 30 methods: registration, paging and what
+/// Everything that has come and may still be used, by keyframe id. Many methods: registration, paging and what
 /// follows from both look at the same records.
 #[derive(Debug, Clone)]
 pub(crate) struct KeyframeStore {
@@ -408,11 +408,11 @@ impl KeyframeStore {
         }
         let is_first = registered.depth.width_px == 0;
         if is_first {
-            registered.n_depth_looks = 0;
+            registered.depth_fit.n_looks = 0;
         }
         engine.set_depth(registered.view_ix, Some(Arc::clone(&depth)))?;
         (registered.median_depth, registered.depth) = (depth.median(), depth);
-        registered.ratios = None;
+        registered.depth_fit.log_metres = None;
         registered.home.copy = None;
         Ok(is_first)
     }

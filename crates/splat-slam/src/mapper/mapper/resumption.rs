@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::mapper::keyframes::image_codec::{Content, SavedView};
-use crate::mapper::keyframes::registered::RegisteredKeyframe;
+use crate::mapper::keyframes::registered::{DepthFit, RegisteredKeyframe};
 use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::map_file::checkpoint::Checkpoint;
 use crate::mapper::mapper::Mapper;
@@ -150,9 +150,11 @@ impl Mapper {
             lens: None,
             depth: Arc::new(DepthMap::none()),
             median_depth: None,
-            depth_factor: 1.0,
-            n_depth_looks: u8::MAX,
-            ratios: Some([None; 2]),
+            depth_fit: DepthFit {
+                factor: 1.0,
+                n_looks: u8::MAX,
+                log_metres: Some([None; 2]),
+            },
             health: PoseQuality::default(),
             is_held_out,
             home: Residency {

@@ -238,7 +238,7 @@ fn update_registered(
     if (scale - 1.0).abs() > f64::EPSILON {
         let depth = Arc::new(rescaled(&registered.depth, scale));
         registered.median_depth = depth.median();
-        registered.ratios = None;
+        registered.depth_fit.log_metres = None;
         registered.depth = Arc::clone(&depth);
         if depth.width_px > 0 {
             engine.set_depth(registered.view_ix, Some(depth))?;
