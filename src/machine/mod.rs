@@ -3,3 +3,5 @@
 pub mod memory;
 
 pub mod probe;
+
+pub mod priority;

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::node::backpressure::Backpressure;
-use crate::node::threads::{Answer, in_own_pool};
+use crate::node::threads::{Answer, Niceness, in_own_pool};
 use crate::params::params::Params;
 use splat_geometry::answer::GeometryBatch;
 use splat_geometry::error::GeometryError;
@@ -117,7 +117,9 @@ pub(crate) fn run_geometry(
     backpressure: Option<&Backpressure>,
 ) -> Option<GeometryError> {
     if let Some(backpressure) = backpressure {
-        return in_own_pool(|| run_live(stage, batches, answers, backpressure));
+        return in_own_pool("geometry", Niceness::Geometry, || {
+            run_live(stage, batches, answers, backpressure)
+        });
     }
     while let Some(batch) = batches.recv() {
         match stage.infer(&batch) {
@@ -163,8 +165,7 @@ fn run_live(
             }
             Next::Ended => return last_answer(stage, answers),
         };
-        let pending_depths = stage.model.pending_depths();
-        backpressure.note(stage.has_registered, pending_depths);
+        backpressure.note(stage.has_registered);
         if took_batch {
             backpressure.done();
         }

@@ -9,7 +9,7 @@ use crate::node::job::{Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, SelectStage};
 use crate::node::publish_threads::{self, RateLimitedLog, run_live, run_publisher};
 use crate::node::source_thread::SourceStage;
-use crate::node::threads::{Answer, joined, run_select, run_source};
+use crate::node::threads::{Answer, Niceness, in_own_pool, joined, run_select, run_source};
 use crate::node::track_thread::{KeyframeUpdate, TrackStage, TrackingSummary, run_track};
 use crate::node::{open, refinement};
 use splat_geometry::error::GeometryError;
@@ -250,7 +250,12 @@ impl Stages {
                 progress_tx.send(progress).ok();
             };
             let updates = (is_live, updates_tx.as_ref());
-            run_map(self.map, updates, &answers, &mut publish)
+            let run = || run_map(self.map, updates, &answers, &mut publish);
+            if is_live {
+                in_own_pool("map", Niceness::Map, run)
+            } else {
+                run()
+            }
         })?;
         let publisher = self.publisher;
         let publish_thread = spawn("publish", move || {

@@ -1,10 +1,12 @@
 //! What the threads of the source, of selection and of geometry do until their input ends.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::anyhow;
 
+use crate::machine::priority;
 use crate::node::backpressure::Backpressure;
 use crate::node::map_stage::SelectStage;
 use crate::node::source_thread::SourceStage;
@@ -14,7 +16,9 @@ use splat_io::queue::{Received, Receiver, Sender};
 use splat_types::frame::{Batch, Frame};
 
 /// Live, while no frame comes: time between looks at whether geometry stands idle.
-const LIVE_TICK: Duration = Duration::from_millis(50);
+const LIVE_TICK: Duration = Duration::from_millis(10);
+/// Live: full batches that wait for geometry, about 8 MB each with the default size. Of more, the oldest goes.
+const MAX_BATCHES_WAITING: usize = 12;
 
 /// What crosses from geometry to the map; no batch at the model's end.
 pub(crate) type Answer = (Option<Arc<Batch>>, GeometryBatch);
@@ -66,43 +70,70 @@ pub(crate) fn run_select(
     stage
 }
 
-/// Batches go out as soon as geometry takes them; while it takes none, frames are dropped before selection.
+/// Live: batches go out when geometry takes them, and selection waits for nobody: keyframes gather until then.
 fn run_select_live(
     mut stage: SelectStage,
     frames: &Receiver<Frame>,
     batches: &Sender<Arc<Batch>>,
     backpressure: &Backpressure,
 ) -> SelectStage {
+    let mut full = VecDeque::new();
     loop {
-        let full = match frames.recv_timeout(LIVE_TICK) {
-            Received::Item(frame) => stage.push(frame),
-            Received::Nothing => None,
+        match frames.recv_timeout(LIVE_TICK) {
+            Received::Item(frame) => full.extend(stage.push(frame)),
+            Received::Nothing => {}
             Received::Ended => break,
-        };
-        let batch = match full {
-            None if backpressure.is_due(stage.n_new()) => stage.finish(),
-            full => full,
-        };
+        }
+        while full.len() > MAX_BATCHES_WAITING {
+            full.pop_front();
+            backpressure.count_dropped_batch();
+        }
+        if !backpressure.is_open() {
+            continue;
+        }
+        let batch = full.pop_front().or_else(|| {
+            let is_due = backpressure.is_due(stage.n_new());
+            is_due.then(|| stage.finish()).flatten()
+        });
         if let Some(batch) = batch
-            && !(backpressure.wait_to_send() && batches.send(Arc::new(batch)).is_ok())
+            && !(backpressure.send() && batches.send(Arc::new(batch)).is_ok())
         {
             return stage;
         }
     }
-    if let Some(batch) = stage.finish() {
-        drop(batches.send(Arc::new(batch)));
+    for batch in full.into_iter().chain(stage.finish()) {
+        if batches.send(Arc::new(batch)).is_err() {
+            break;
+        }
     }
     stage
 }
 
-/// Live, parallel loops of geometry must not wait behind those of the map in the pool that all share: threads of their
-/// own get their part of the processors from the system.
-pub(crate) fn in_own_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
-    let named = |ix: usize| format!("geometry-{ix}");
-    match rayon::ThreadPoolBuilder::new().thread_name(named).build() {
+/// Who yields to whom where processors are few, as Linux counts it: 0 for everything that a pose waits for. One of
+/// niceness 5 gets a third of the time beside one of 0, one of 10 a tenth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Niceness {
+    /// Poses and depth of keyframes.
+    Geometry = 5,
+    /// Optimiser steps.
+    Map = 10,
+}
+
+/// Live: parallel loops of one stage must not wait behind those of another in the pool that all share. They get threads of
+/// their own, and the system shares the processors among them by their niceness.
+pub(crate) fn in_own_pool<T: Send>(
+    name: &'static str,
+    niceness: Niceness,
+    work: impl FnOnce() -> T + Send,
+) -> T {
+    let pool = rayon::ThreadPoolBuilder::new()
+        .thread_name(move |ix| format!("{name}-{ix}"))
+        .start_handler(move |_| priority::lower_this_thread(niceness as i32))
+        .build();
+    match pool {
         Ok(pool) => pool.install(work),
         Err(e) => {
-            tracing::warn!("geometry shares its threads with mapping and may be late: {e}");
+            tracing::warn!("{name} shares its threads with other stages; poses may be late: {e}");
             work()
         }
     }

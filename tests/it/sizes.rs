@@ -64,20 +64,23 @@ fn is_field(line: &str) -> bool {
 }
 
 fn is_method(line: &str) -> bool {
-    line.strip_prefix("    ")
+    let Some(line) = line
+        .strip_prefix("    ")
         .filter(|line| !line.starts_with(' '))
-        .is_some_and(|line| {
-            line.split('(').next().is_some_and(|head| {
-                head.split(' ').any(|word| word == "fn") && !head.starts_with("//")
-            }) || line.starts_with("pub(crate) fn ")
-                || line.starts_with("pub(super) fn ")
-        })
+    else {
+        return false;
+    };
+    let line = line.strip_prefix("pub(crate) ").unwrap_or(line);
+    let line = line.strip_prefix("pub(super) ").unwrap_or(line);
+    let head = line.split('(').next().unwrap_or_default();
+    !line.starts_with("//") && head.split(' ').any(|word| word == "fn")
 }
 
 /// What `text` declares, added to `types` of its crate. `rustfmt` puts every item's end at its own indentation.
 fn count(text: &str, path: &str, types: &mut BTreeMap<String, Type>) {
     let mut docs = String::new();
     let mut inside: Option<(String, bool)> = None;
+    let mut n_fields = 0;
     for line in text.lines() {
         if line == "mod tests {" {
             return;
@@ -87,7 +90,9 @@ fn count(text: &str, path: &str, types: &mut BTreeMap<String, Type>) {
             if line.starts_with('}') {
                 inside = None;
             } else if *is_struct {
-                found.n_fields += usize::from(is_field(line));
+                n_fields += usize::from(is_field(line));
+                // Two modules may have a type of one name.
+                found.n_fields = found.n_fields.max(n_fields);
             } else {
                 found.n_methods += usize::from(is_method(line));
             }
@@ -102,6 +107,7 @@ fn count(text: &str, path: &str, types: &mut BTreeMap<String, Type>) {
             found.docs.push_str(&docs);
             path.clone_into(&mut found.path);
             inside = line.ends_with('{').then(|| (name.to_owned(), true));
+            n_fields = 0;
         } else if let Some(name) = implemented(line).filter(|_| line.ends_with('{')) {
             inside = Some((name.to_owned(), false));
         }

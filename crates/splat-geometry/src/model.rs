@@ -21,11 +21,6 @@ pub trait GeometryModel: Send {
         None
     }
 
-    /// Keyframes that `depth` has still to indicate for the first time.
-    fn pending_depths(&self) -> usize {
-        0
-    }
-
     /// Whether it answers a batch of one new keyframe as well as a full one, once it has registered some.
     fn accepts_small_batches(&self) -> bool {
         false

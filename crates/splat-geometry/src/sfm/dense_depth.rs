@@ -93,11 +93,6 @@ impl Densifier {
         reported
     }
 
-    /// Views without depth so far.
-    pub(crate) fn n_waiting(&self) -> usize {
-        self.waiting.len()
-    }
-
     /// One more view with depth, of those whose poses were reported: the newest, since frames are tracked by it.
     pub(crate) fn next(&mut self) -> Option<View> {
         let view = self.waiting.pop_back().or_else(|| self.again.pop_front())?;

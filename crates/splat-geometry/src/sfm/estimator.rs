@@ -333,10 +333,6 @@ impl GeometryModel for Sfm {
         })
     }
 
-    fn pending_depths(&self) -> usize {
-        self.densifier.n_waiting()
-    }
-
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         let sparse = self.finish_sparse();
         Ok(self.densify(&sparse))
