@@ -25,11 +25,13 @@ mod tests {
             rustix::process::getpriority_process(Some(thread)).expect("readable")
         };
         let before = niceness();
-        let lowered = std::thread::spawn(move || {
+        let builder = std::thread::Builder::new().name("lowered".to_owned());
+        let lowered = builder.spawn(move || {
             super::lower_this_thread(before + 3);
             niceness()
         });
-        assert_eq!(lowered.join().expect("ends"), before + 3);
+        let lowered = lowered.expect("starts").join().expect("ends");
+        assert_eq!(lowered, before + 3);
         assert_eq!(niceness(), before);
     }
 }

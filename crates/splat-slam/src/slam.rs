@@ -55,7 +55,7 @@ pub struct SlamParams {
 #[derive(Debug, Clone)]
 pub enum SlamEvent {
     /// The frame's own pose; `world_from_cam` is in the map's unit.
-    Tracked(TrackedFrame),
+    Tracked(Box<TrackedFrame>),
     /// The frame is a keyframe and has this id. Its pose follows with the batch that it is in.
     Keyframe(u32),
     /// The map has changed.
@@ -125,7 +125,7 @@ impl Slam {
     pub fn push(&mut self, frame: Frame) -> Result<Vec<SlamEvent>, SlamError> {
         let mut events = Vec::new();
         if let Some(tracker) = &mut self.tracker {
-            events.push(SlamEvent::Tracked(tracker.track(&frame)));
+            events.push(SlamEvent::Tracked(Box::new(tracker.track(&frame))));
         }
         if let Some(keyframe) = self.selector.push(frame) {
             events.push(SlamEvent::Keyframe(keyframe.id));
