@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::eval::lpips;
 use crate::node::engines::Engines;
-use crate::node::job::{Job, Outcome, Progress, linger, publisher};
+use crate::node::job::{self, Job, Outcome, Progress, linger};
 use crate::node::stop::Stop;
 use crate::node::{localise, open_source, pipeline, ros2, run_dir};
 use crate::params::error::ParamsError;
@@ -147,9 +147,9 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
     let transport = ros2.as_ref().map(ros2::Node::transport).transpose()?;
-    let publisher = publisher(&params, transport)?;
-    if let (Some(node), Some(publisher)) = (&ros2, &publisher) {
-        node.serve(publisher, &stop, params.ros2.autostart)?;
+    let output = job::output(&params, transport)?;
+    if let (Some(node), Some(output)) = (&ros2, &output) {
+        node.serve(&output.handles.publisher, &stop, params.ros2.autostart)?;
     }
     let is_live = source.is_live() || params.source.rate > 0.0;
     let job = Job {
@@ -158,7 +158,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         is_live,
         stop: stop.clone(),
         out: out.map(Path::to_owned),
-        publisher,
+        output,
         engines: Engines::default(),
     };
     let bar = bar(is_terminal);
@@ -195,13 +195,13 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
         );
     }
     if outcome.snapshot.poses.is_empty() {
-        let counts = &outcome.counts;
+        let counts = &outcome.input.counts;
         let fault = counts
             .fault
             .as_ref()
             .map(|f| format!("; {f}"))
             .unwrap_or_default();
-        let why = if outcome.n_selected == 0 {
+        let why = if outcome.input.n_selected == 0 {
             format!(
                 "none of {} frames could be used ({} undecodable)",
                 counts.received, counts.undecodable
@@ -214,7 +214,7 @@ fn verdict(outcome: &Outcome, input: &str) -> anyhow::Result<ExitCode> {
         };
         anyhow::bail!(
             "no map: {why}; {} of {} frames were keyframes{fault}; a map needs a camera that moves sideways past textured things: {input}",
-            outcome.n_selected,
+            outcome.input.n_selected,
             counts.received,
         );
     }

@@ -19,6 +19,7 @@ use splat_geometry::ground_truth::model::GroundTruthModel;
 use splat_geometry::model::GeometryModel;
 use splat_geometry::sfm::estimator::Sfm;
 use splat_io::frame_source::{Source, SourceCounts};
+use splat_ros::output::Output;
 use splat_ros::publisher::Publisher;
 use splat_ros::transport::Transport;
 use splat_slam::mapper::mapper::Mapper;
@@ -38,8 +39,8 @@ pub struct Job {
     pub stop: Stop,
     /// Run directory: autosaves go there, and what memory has no room for.
     pub out: Option<PathBuf>,
-    /// The way out, where anything is to go out before the end.
-    pub publisher: Option<Arc<Publisher>>,
+    /// Where anything is to go out before the end.
+    pub output: Option<Output>,
     pub engines: Engines,
 }
 
@@ -71,23 +72,37 @@ pub struct StageSecs {
     pub track: f64,
 }
 
+/// Seconds from the selection of each keyframe.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct KeyframeLatency {
+    pub to_pose_secs: Vec<f64>,
+    /// To the first snapshot that has it.
+    pub to_snapshot_secs: Vec<f64>,
+}
+
+/// What came of the input before it was tracked and mapped.
+#[derive(Debug)]
+pub struct InputSummary {
+    pub counts: SourceCounts,
+    /// Live: frames that made room for newer ones before selection.
+    pub n_dropped: u64,
+    /// Keyframes.
+    pub n_selected: usize,
+    /// Stamps of all frames that arrived, in order.
+    pub frame_stamps: Vec<Stamp>,
+    /// Ground truth of the keyframes, where the recording has it.
+    pub truth: Vec<(Stamp, Rigid)>,
+}
+
 /// What a run leaves behind.
 pub struct Outcome {
     pub snapshot: Arc<Snapshot>,
     pub map: Mapper,
-    pub counts: SourceCounts,
-    pub n_dropped: u64,
-    pub n_selected: usize,
-    /// Stamps of all frames that arrived, in order.
-    pub frame_stamps: Vec<Stamp>,
+    pub input: InputSummary,
     /// Poses of all frames that the tracker saw.
     pub tracking: TrackingSummary,
-    /// Ground truth of the keyframes, where the recording has it.
-    pub truth: Vec<(Stamp, Rigid)>,
     pub secs: StageSecs,
-    /// Seconds from the selection of a keyframe to its pose, and to the first snapshot that has it.
-    pub keyframe_to_pose_secs: Vec<f64>,
-    pub keyframe_to_snapshot_secs: Vec<f64>,
+    pub latency: KeyframeLatency,
     /// Why keyframes are missing, in the geometry model's words.
     pub geometry_note: Option<String>,
     /// Times that the engine was lost.
@@ -114,7 +129,7 @@ impl std::fmt::Debug for Outcome {
             f,
             "Outcome({} of {} keyframes, {:?})",
             self.snapshot.poses.len(),
-            self.n_selected,
+            self.input.n_selected,
             self.error
         )
     }
@@ -171,19 +186,15 @@ pub(crate) fn spawn<T: Send + 'static>(
 }
 
 /// The way out that the parameters ask for, if any, and over `transport`.
-pub fn publisher(
+pub fn output(
     params: &Params,
     transport: Option<Box<dyn Transport>>,
-) -> anyhow::Result<Option<Arc<Publisher>>> {
+) -> anyhow::Result<Option<Output>> {
     let (publish, has_transport) = (&params.publish, transport.is_some());
     if !(publish.zenoh || has_transport || !publish.record.is_empty()) {
         return Ok(None);
     }
-    let publisher = Publisher::open(publish)?;
-    Ok(Some(Arc::new(match transport {
-        Some(transport) => publisher.with_transport(transport),
-        None => publisher,
-    })))
+    Ok(Some(Output::open(publish, transport)?))
 }
 
 /// Keeps the way out up for late joiners and services, then closes it; Ctrl-C cuts the wait short.

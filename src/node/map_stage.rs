@@ -4,15 +4,17 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::node::autosave::Autosave;
-use crate::node::job::Progress;
+use crate::node::job::{KeyframeLatency, Progress};
 use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
 use crate::node::requests::RequestHandler;
-use crate::node::stop::{ShutdownTimeout, Stop};
+use crate::node::stop::ShutdownTimeout;
 use crate::params::params::Params;
 use splat_engine::error::EngineError;
 use splat_geometry::answer::GeometryBatch;
-use splat_ros::publisher::Publisher;
+use splat_ros::output::{Output, OutputHandles};
+use splat_ros::reports::Reports;
+use splat_ros::status::{MapStatus, SelectStatus};
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::params::MapperParams;
 use splat_slam::mapper::train::schedule::{self, Phase};
@@ -39,6 +41,7 @@ const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 pub(crate) struct SelectStage {
     selector: Selector,
     batcher: Batcher,
+    reports: Option<Arc<Reports>>,
     pub(crate) n_selected: usize,
     pub(crate) frame_stamps: Vec<Stamp>,
     pub(crate) truth: Vec<(Stamp, Rigid)>,
@@ -49,29 +52,49 @@ pub(crate) struct MapStage {
     pub(crate) map: Mapper,
     params: MapperParams,
     is_live: bool,
-    stop: Stop,
     n_frames: Option<u64>,
     pub(crate) request_handler: RequestHandler,
     /// Live: frames of the tracker to look at while there is nothing else to do.
     pub(crate) fitter: Option<RefinementWorker>,
-    publisher: Option<Arc<Publisher>>,
-    /// Age of keyframes that no snapshot has shown.
-    unpublished: BTreeMap<u32, Stopwatch>,
+    reports: Option<Arc<Reports>>,
     pub(crate) autosave: Option<Autosave>,
     pub(crate) recovery: Recovery,
     since_snapshot: Stopwatch,
     grace: ShutdownTimeout,
+    pub(crate) figures: MapFigures,
+}
+
+/// What became of the keyframes that came, and how long it took.
+#[derive(Debug, Default)]
+pub(crate) struct MapFigures {
     n_keyframes: usize,
+    /// Age of keyframes that no snapshot has shown.
+    unpublished: BTreeMap<u32, Stopwatch>,
+    pub(crate) latency: KeyframeLatency,
     pub(crate) optimise_secs: f64,
-    pub(crate) keyframe_to_pose_secs: Vec<f64>,
-    pub(crate) keyframe_to_snapshot_secs: Vec<f64>,
+}
+
+impl MapFigures {
+    /// A snapshot shows its keyframes from now on.
+    fn shown(&mut self, snapshot: &Snapshot) {
+        for pose in &snapshot.poses {
+            if let Some(age) = self.unpublished.remove(&pose.keyframe_id) {
+                self.latency.to_snapshot_secs.push(age.secs());
+            }
+        }
+        // Keyframes that never get a pose must not pile up.
+        while self.unpublished.len() > splat_slam::mapper::mapper::MAX_WAITING {
+            self.unpublished.pop_first();
+        }
+    }
 }
 
 impl SelectStage {
-    pub(crate) fn new(params: &Params, first_id: u32) -> Self {
+    pub(crate) fn new(params: &Params, first_id: u32, output: Option<&OutputHandles>) -> Self {
         Self {
             selector: Selector::new(params.select.clone()).counting_from(first_id),
             batcher: Batcher::new(&params.select),
+            reports: output.map(|output| Arc::clone(&output.reports)),
             n_selected: 0,
             frame_stamps: Vec::new(),
             truth: Vec::new(),
@@ -84,10 +107,19 @@ impl SelectStage {
         }
         let keyframe = self.selector.push(frame)?;
         self.n_selected += 1;
+        let n_keyframes = self.n_selected as u64;
+        self.report(|status| status.n_keyframes = n_keyframes);
         if let Some(truth) = keyframe.frame.truth {
             self.truth.push((keyframe.frame.stamp, truth));
         }
         self.batcher.push(keyframe)
+    }
+
+    /// Changes selection's part of the status; nothing where no status goes out.
+    pub(crate) fn report(&self, change: impl FnOnce(&mut SelectStatus)) {
+        if let Some(reports) = &self.reports {
+            reports.select.update(change);
+        }
     }
 
     /// Keyframes that were in no batch so far.
@@ -107,30 +139,25 @@ impl MapStage {
         params: &Params,
         (is_live, n_frames): (bool, Option<u64>),
         recovery: Recovery,
-        publisher: Option<Arc<Publisher>>,
+        output: Option<&mut Output>,
     ) -> Self {
-        let calls = publisher
-            .as_ref()
-            .and_then(|publisher| publisher.take_calls());
+        let (reports, calls) = output
+            .map(|output| (Arc::clone(&output.handles.reports), output.calls.take()))
+            .unzip();
         let stop = recovery.stop.clone();
         Self {
             map,
             params: params.mapper(),
             is_live,
-            request_handler: RequestHandler::new(calls, &params.track, stop.clone()),
-            grace: ShutdownTimeout::new(stop.clone()),
-            stop,
+            request_handler: RequestHandler::new(calls.flatten(), &params.track, stop.clone()),
+            grace: ShutdownTimeout::new(stop),
             n_frames,
             fitter: None,
-            publisher,
-            unpublished: BTreeMap::new(),
+            reports,
             autosave: None,
             recovery,
             since_snapshot: Stopwatch::start(),
-            n_keyframes: 0,
-            optimise_secs: 0.0,
-            keyframe_to_pose_secs: Vec::new(),
-            keyframe_to_snapshot_secs: Vec::new(),
+            figures: MapFigures::default(),
         }
     }
 
@@ -148,26 +175,25 @@ impl MapStage {
             .n_frames
             .zip(newest)
             .map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
+        let figures = &mut self.figures;
         for keyframe in batch.iter().flat_map(|b| &b.keyframes) {
-            self.n_keyframes = self.n_keyframes.max(keyframe.id as usize + 1);
+            figures.n_keyframes = figures.n_keyframes.max(keyframe.id as usize + 1);
             if !self.map.has_keyframe(keyframe.id) {
-                self.unpublished.insert(keyframe.id, keyframe.age);
+                figures.unpublished.insert(keyframe.id, keyframe.age);
             }
         }
         let watch = Stopwatch::start();
         let fresh = self.on_map(|map| map.add(batch, geometry, progress));
         for id in fresh.unwrap_or_default() {
-            if let Some(age) = self.unpublished.get(&id) {
+            if let Some(age) = self.figures.unpublished.get(&id) {
                 let secs = age.secs();
                 tracing::debug!("keyframe {id} has its pose after {secs:.2} s");
-                self.keyframe_to_pose_secs.push(secs);
-                if let Some(publisher) = &self.publisher {
-                    publisher.note(|status| status.keyframe_to_pose.note(secs));
-                }
+                self.figures.latency.to_pose_secs.push(secs);
+                self.report(|status| status.keyframe_to_pose.note(secs));
             }
         }
-        self.optimise_secs += watch.secs();
-        self.note();
+        self.figures.optimise_secs += watch.secs();
+        self.report_counts();
         if !self.is_live {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
@@ -199,21 +225,21 @@ impl MapStage {
         let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
         self.make_steps(last, &phase, publish);
         // Splats as they were seeded say less of a pose than the geometry that seeded them.
-        if self.map.n_steps() > 0 && !self.stop.is_asked() {
+        if self.map.n_steps() > 0 && !self.recovery.stop.is_asked() {
             self.on_map(Mapper::refine_held_out);
         }
-        self.optimise_secs += watch.secs();
+        self.figures.optimise_secs += watch.secs();
         // The last map file must not be overtaken by an older one.
         self.autosave = None;
         // After a fault that ends mapping: the last that was read before it.
         let snapshot = self.snapshot();
         let snapshot = snapshot.unwrap_or_else(|| self.map.last_snapshot());
-        self.note();
+        self.report_counts();
         let last = Progress {
             has_ended: true,
             ..self.progress()
         };
-        publish(Arc::clone(&snapshot), last);
+        self.hand_over(Arc::clone(&snapshot), last, publish);
         snapshot
     }
 
@@ -254,17 +280,11 @@ impl MapStage {
             Err(error) => error,
         };
         if self.recovery.error.is_none() {
-            self.note_recovery(Some(error.to_string()));
+            self.report(|status| status.recovering = Some(error.to_string()));
             self.recovery.recover(&mut self.map, &error);
-            self.note_recovery(None);
+            self.report(|status| status.recovering = None);
         }
         None
-    }
-
-    fn note_recovery(&self, recovering: Option<String>) {
-        if let Some(publisher) = &self.publisher {
-            publisher.note(|status| status.recovering = recovering);
-        }
     }
 
     /// After a stop, geometry gets a moment for the batch that it is at, and no more: a network can take minutes.
@@ -272,13 +292,16 @@ impl MapStage {
         self.grace.is_over(SECS_AFTER_STOP)
     }
 
-    /// Writes the map's part of the status.
-    fn note(&self) {
-        let Some(publisher) = &self.publisher else {
-            return;
-        };
-        let (map, optimise_secs) = (&self.map, self.optimise_secs);
-        publisher.note(|status| {
+    /// Changes the map's part of the status; nothing where no status goes out.
+    fn report(&self, change: impl FnOnce(&mut MapStatus)) {
+        if let Some(reports) = &self.reports {
+            reports.map.update(change);
+        }
+    }
+
+    fn report_counts(&self) {
+        let (map, optimise_secs) = (&self.map, self.figures.optimise_secs);
+        self.report(|status| {
             status.n_registered = map.n_keyframes() as u64;
             status.n_submaps = map.submaps().len() as u64;
             status.n_splats = map.n_splats() as u64;
@@ -293,7 +316,7 @@ impl MapStage {
     fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
         let watch = Stopwatch::start();
         self.make_steps(target, &|_| Phase::Streaming, publish);
-        self.optimise_secs += watch.secs();
+        self.figures.optimise_secs += watch.secs();
         self.snapshot_if_due(publish);
     }
 
@@ -304,7 +327,7 @@ impl MapStage {
         phase: &dyn Fn(u64) -> Phase,
         publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
     ) {
-        while self.map.n_steps() < target && !self.stop.is_asked() {
+        while self.map.n_steps() < target && !self.recovery.stop.is_asked() {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
             let phase = phase(self.map.n_steps());
             let made = self.map.step(n, phase);
@@ -324,7 +347,7 @@ impl MapStage {
             && self.map.n_splats() > 0
             && let Some(snapshot) = self.snapshot()
         {
-            publish(snapshot, self.progress());
+            self.hand_over(snapshot, self.progress(), publish);
         }
         if self.recovery.error.is_none() {
             let autosave = self.autosave.as_mut();
@@ -333,29 +356,32 @@ impl MapStage {
         }
     }
 
+    /// The status counts the splats of what goes out: fewer than the engine's where some are not finite.
+    fn hand_over(
+        &self,
+        snapshot: Arc<Snapshot>,
+        progress: Progress,
+        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    ) {
+        self.report(|status| status.n_splats = snapshot.splats.len() as u64);
+        publish(snapshot, progress);
+    }
+
     /// `None` once mapping has ended.
     fn snapshot(&mut self) -> Option<Arc<Snapshot>> {
-        self.note();
-        if let (Some(moved), Some(publisher)) = (self.map.take_correction(), &self.publisher) {
-            publisher.queue_correction(moved);
+        self.report_counts();
+        if let (Some(moved), Some(reports)) = (self.map.take_correction(), &self.reports) {
+            reports.correction.add(moved);
         }
         let snapshot = self.on_map(Mapper::snapshot)?;
         self.since_snapshot = Stopwatch::start();
-        for pose in &snapshot.poses {
-            if let Some(age) = self.unpublished.remove(&pose.keyframe_id) {
-                self.keyframe_to_snapshot_secs.push(age.secs());
-            }
-        }
-        // Keyframes that never get a pose must not pile up.
-        while self.unpublished.len() > splat_slam::mapper::mapper::MAX_WAITING {
-            self.unpublished.pop_first();
-        }
+        self.figures.shown(&snapshot);
         Some(snapshot)
     }
 
     fn progress(&self) -> Progress {
         Progress {
-            n_keyframes: self.n_keyframes,
+            n_keyframes: self.figures.n_keyframes,
             n_registered: self.map.n_keyframes(),
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),

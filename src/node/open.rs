@@ -1,7 +1,6 @@
 //! A job -> the stages that hold a map: begun anew, or gone on with from a saved one.
 
 use std::path::Path;
-use std::sync::mpsc::Receiver as Calls;
 
 use anyhow::anyhow;
 
@@ -13,7 +12,6 @@ use crate::node::recovery::Recovery;
 use crate::node::stop::ShutdownTimeout;
 use crate::node::track_thread::TrackStage;
 use splat_io::queue::{WhenFull, queue};
-use splat_ros::service_server::ServiceCall;
 use splat_slam::mapper::map_file::checkpoint;
 use splat_slam::mapper::mapper::Mapper;
 use splat_types::snapshot::Scale;
@@ -25,11 +23,8 @@ pub(crate) struct Opened {
     pub(crate) first_id: u32,
 }
 
-pub(crate) fn open(
-    job: &Job,
-    scale: Scale,
-    calls: Option<Calls<ServiceCall>>,
-) -> anyhow::Result<Opened> {
+/// Takes over the calls of services.
+pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
     let params = &job.params;
     let engine = job.engines.best(params.backend, params.deterministic)?;
     let pages = PageFile::new(job.out.as_deref(), params.map.max_page_file_mib << 20);
@@ -52,11 +47,10 @@ pub(crate) fn open(
         params,
         (job.is_live, n_frames),
         Recovery::new(params, job.is_live, job.engines.clone(), job.stop.clone()),
-        job.publisher.clone(),
+        job.output.as_mut(),
     );
-    map.request_handler.keep_calls(calls);
     map.autosave = Autosave::start(job.out.as_deref(), params.map.autosave_secs)?;
-    if map.autosave.is_some() || job.publisher.is_some() {
+    if map.autosave.is_some() || job.output.is_some() {
         let (reported, landmarks) = queue("landmarks", 1, WhenFull::DropOldest);
         track.save_landmarks_to(params.map.autosave_secs, reported);
         map.request_handler.receive_landmarks(landmarks);

@@ -1,13 +1,14 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
-use std::sync::mpsc::Receiver as Calls;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
-use crate::node::job::{Job, Outcome, Progress, StageSecs, model, spawn};
+use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, SelectStage};
-use crate::node::publish_threads::{self, RateLimitedLog, run_live, run_publisher};
+use crate::node::publish_threads::{
+    LiveStage, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
+};
 use crate::node::source_thread::SourceStage;
 use crate::node::threads::{Answer, Niceness, in_own_pool, joined, run_select, run_source};
 use crate::node::track_thread::{KeyframeUpdate, TrackStage, TrackingSummary, run_track};
@@ -15,8 +16,8 @@ use crate::node::{open, refinement};
 use splat_geometry::error::GeometryError;
 use splat_geometry::model::GeometryModel;
 use splat_io::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
+use splat_ros::output::{Output, Streams};
 use splat_ros::publisher::Publisher;
-use splat_ros::service_server::ServiceCall;
 use splat_slam::track::params::Photometric;
 use splat_types::correction::MapCorrection;
 use splat_types::frame::Batch;
@@ -38,69 +39,75 @@ const UPDATE_SECS: f64 = 1.0;
 /// called on this thread.
 pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<Outcome> {
     let watch = Stopwatch::start();
-    let mut calls = None;
     loop {
-        let (mut params, stop, publisher) =
-            (job.params.clone(), job.stop.clone(), job.publisher.clone());
+        let (mut params, stop) = (job.params.clone(), job.stop.clone());
         let (is_live, out, engines) = (job.is_live, job.out.clone(), job.engines.clone());
-        let mut ended = run_once(job, calls.take(), on_progress)?;
+        let handles = job.output.as_ref().map(|output| output.handles.clone());
+        let mut ended = run_once(job, on_progress)?;
         if !stop.takes_restart() {
+            let publisher = handles.map(|handles| handles.publisher);
             let mut outcome = ended.into_outcome(publisher, stop.is_asked());
             outcome.secs.wall = watch.secs();
             return Ok(outcome);
         }
         tracing::info!("the map begins again");
-        calls = ended.map.request_handler.take_calls();
         params.map.resume = ended.map.request_handler.take_wanted();
-        if let Some(publisher) = &publisher {
-            publisher.queue_correction(MapCorrection::restart(!params.map.resume.is_empty()));
+        if let Some(handles) = &handles {
+            let restart = MapCorrection::restart(!params.map.resume.is_empty());
+            handles.reports.correction.add(restart);
         }
+        let calls = ended.map.request_handler.take_calls();
         job = Job {
             source: ended.source.into_source(),
             params,
             is_live,
             stop,
-            publisher,
+            output: handles.zip(ended.streams).map(|(handles, streams)| Output {
+                handles,
+                streams,
+                calls,
+            }),
             out,
             engines,
         };
     }
 }
 
-fn run_once(
-    job: Job,
-    calls: Option<Calls<ServiceCall>>,
-    on_progress: &mut dyn FnMut(Progress),
-) -> anyhow::Result<End> {
+fn run_once(job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
-    run_with(model, scale, job, calls, on_progress)
+    run_with(model, scale, job, on_progress)
 }
 
 fn run_with(
     model: Box<dyn GeometryModel>,
     scale: Scale,
-    job: Job,
-    calls: Option<Calls<ServiceCall>>,
+    mut job: Job,
     on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<End> {
     let open::Opened {
         mut map,
         mut track,
         first_id,
-    } = open::open(&job, scale, calls)?;
+    } = open::open(&mut job, scale)?;
     let fits = job.params.track.photometric != Photometric::Off;
     if job.is_live && fits && track.is_on() {
         let (client, fitter) = refinement::pair();
         (track.client, map.fitter) = (Some(client), Some(fitter));
     }
-    let publisher = job.publisher;
+    let (handles, streams) = job.output.map(|out| (out.handles, out.streams)).unzip();
+    let publisher = handles.as_ref().map(|handles| &handles.publisher);
+    let (live, snapshots) = publisher
+        .zip(streams)
+        .map(|(publisher, streams)| stages_of(publisher, streams))
+        .unzip();
     let stages = Stages {
         map,
-        select: SelectStage::new(&job.params, first_id),
+        select: SelectStage::new(&job.params, first_id, handles.as_ref()),
         geometry: GeometryStage::new(model, &job.params),
-        track: track.received(publisher.is_some()),
-        source: SourceStage::new(job.source, job.stop, publisher.clone()),
-        publisher,
+        track: track.received(live.is_some()),
+        source: SourceStage::new(job.source, job.stop, handles),
+        live,
+        snapshots,
     };
     if job.params.sequential {
         Ok(stages.in_sequence(on_progress))
@@ -115,7 +122,8 @@ struct Stages {
     geometry: GeometryStage,
     map: MapStage,
     track: TrackStage,
-    publisher: Option<Arc<Publisher>>,
+    live: Option<LiveStage>,
+    snapshots: Option<SnapshotStage>,
 }
 
 /// All stages after their end.
@@ -127,28 +135,24 @@ struct End {
     map: MapStage,
     tracking: TrackingSummary,
     snapshot: Arc<Snapshot>,
+    streams: Option<Streams>,
     error: Option<String>,
 }
 
 impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
-        let publisher = self.publisher;
-        let (mut of_map, mut of_live) = (RateLimitedLog::default(), RateLimitedLog::default());
+        let (mut live, mut snapshots) = (self.live, self.snapshots);
         let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
-            if let Some(publisher) = &publisher {
-                publish_threads::publish_snapshot(
-                    publisher,
-                    &(snapshot, progress.has_ended),
-                    &mut of_map,
-                );
+            if let Some(stage) = &mut snapshots {
+                stage.publish(&(snapshot, progress.has_ended), 0);
             }
             on_progress(progress);
         };
         let mut report = |track: &mut TrackStage| {
             let events = track.take_events();
-            if let Some(publisher) = &publisher {
-                publish_threads::publish_events(publisher, &events, &mut of_live);
+            if let Some(stage) = &mut live {
+                stage.publish(&events);
             }
         };
         let (select, geometry, map) = (&mut self.select, &mut self.geometry, &mut self.map);
@@ -193,6 +197,7 @@ impl Stages {
             geometry: summary(&self.geometry.tally()),
             map: self.map,
             snapshot,
+            streams: joined_streams(live, snapshots),
             error: result.err().map(|e| format!("geometry: {e}")),
         }
     }
@@ -223,9 +228,10 @@ impl Stages {
         };
 
         let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
-        let publisher = self.publisher.clone();
-        let live = publisher.map(|publisher| spawn("live", move || run_live(&publisher, &events)));
-        let live = live.transpose()?;
+        let live = self
+            .live
+            .map(|stage| spawn("live", move || run_live(stage, &events)))
+            .transpose()?;
         let track = spawn("track", move || {
             run_track(self.track, &received, &updates, &events_tx)
         })?;
@@ -257,10 +263,7 @@ impl Stages {
                 run()
             }
         })?;
-        let publisher = self.publisher;
-        let publish_thread = spawn("publish", move || {
-            run_publisher(publisher.as_deref(), &snapshots);
-        })?;
+        let publish = spawn("publish", move || run_publisher(self.snapshots, &snapshots))?;
 
         while let Some(progress) = progress.recv() {
             on_progress(progress);
@@ -276,9 +279,9 @@ impl Stages {
         };
         let (source, n_dropped) = joined("source", source)?;
         let select = joined("select", select)?;
-        joined("publish", publish_thread)?;
+        let publish = joined("publish", publish)?;
         let tracking = joined("track", track)?;
-        live.map(|live| joined("live", live)).transpose()?;
+        let live = live.map(|live| joined("live", live)).transpose()?;
         Ok(End {
             tracking,
             source,
@@ -287,6 +290,7 @@ impl Stages {
             geometry: summary(&tally),
             map,
             snapshot,
+            streams: joined_streams(live, publish),
             error: error.map(|e| format!("geometry: {e}")),
         })
     }
@@ -299,6 +303,11 @@ fn when_full(is_live: bool) -> WhenFull {
     } else {
         WhenFull::Wait
     }
+}
+
+fn joined_streams(live: Option<LiveStage>, snapshots: Option<SnapshotStage>) -> Option<Streams> {
+    let stages = live.zip(snapshots);
+    stages.map(|(live, snapshots)| streams_of(live, snapshots))
 }
 
 fn summary(tally: &Mutex<GeometryTally>) -> GeometryTally {
@@ -318,21 +327,22 @@ impl End {
         let fault = self.map.recovery.error;
         Outcome {
             snapshot: self.snapshot,
-            counts: self.source.counts(),
-            n_dropped: self.n_dropped,
-            n_selected: self.select.n_selected,
-            frame_stamps: self.select.frame_stamps,
-            truth: self.select.truth,
+            input: InputSummary {
+                counts: self.source.counts(),
+                n_dropped: self.n_dropped,
+                n_selected: self.select.n_selected,
+                frame_stamps: self.select.frame_stamps,
+                truth: self.select.truth,
+            },
             secs: StageSecs {
                 wall: 0.0,
                 decode: self.source.decode_secs,
                 geometry: self.geometry.secs,
-                optimise: self.map.optimise_secs,
+                optimise: self.map.figures.optimise_secs,
                 track: self.tracking.secs,
             },
             tracking: self.tracking,
-            keyframe_to_pose_secs: self.map.keyframe_to_pose_secs,
-            keyframe_to_snapshot_secs: self.map.keyframe_to_snapshot_secs,
+            latency: self.map.figures.latency,
             request_handler: self.map.request_handler.at_end(),
             map: self.map.map,
             geometry_note: self.geometry.note,

@@ -6,9 +6,13 @@ use std::time::Duration;
 use crate::machine::memory::rss_mib;
 use splat_io::queue::{Received, Receiver};
 use splat_ros::error::PublishError;
+use splat_ros::map_stream::MapStream;
 use splat_ros::navigation::KeyframeDepth;
 use splat_ros::odometry::PoseEvent;
+use splat_ros::output::Streams;
+use splat_ros::pose_stream::PoseStream;
 use splat_ros::publisher::Publisher;
+use splat_ros::status_stream::StatusStream;
 use splat_types::snapshot::Snapshot;
 use splat_types::time::Stopwatch;
 
@@ -30,7 +34,7 @@ pub(crate) type SnapshotEvent = (Arc<Snapshot>, bool);
 
 /// Logs failures to send, at most once per `LOG_SECS`.
 #[derive(Debug, Default)]
-pub(crate) struct RateLimitedLog {
+struct RateLimitedLog {
     since: Option<Stopwatch>,
 }
 
@@ -45,65 +49,116 @@ impl RateLimitedLog {
     }
 }
 
-fn send_event(publisher: &Publisher, event: &LiveEvent) -> Result<(), PublishError> {
-    match event {
-        LiveEvent::Frame(frame) => publisher.live(frame),
-        LiveEvent::Keyframe(seen) => publisher.keyframe(seen),
+/// Poses and the status on their way out.
+#[derive(Debug)]
+pub(crate) struct LiveStage {
+    publisher: Arc<Publisher>,
+    poses: PoseStream,
+    status: StatusStream,
+    rate_limited: RateLimitedLog,
+}
+
+impl LiveStage {
+    /// In sequence: publishes the events that have gathered.
+    pub(crate) fn publish(&mut self, events: &[LiveEvent]) {
+        events.iter().for_each(|event| self.send_event(event));
+    }
+
+    fn send_event(&mut self, event: &LiveEvent) {
+        let sent = match event {
+            LiveEvent::Frame(frame) => {
+                self.status.count(frame);
+                self.poses.live(&self.publisher, frame)
+            }
+            LiveEvent::Keyframe(seen) => self.poses.keyframe(&self.publisher, seen),
+        };
+        self.rate_limited.of(sent);
+    }
+
+    fn repeat_transforms(&mut self) {
+        let sent = self.poses.repeat_transforms(&self.publisher);
+        self.rate_limited.of(sent);
+    }
+
+    fn send_status(&mut self) {
+        let sent = self.status.send(&self.publisher, rss_mib());
+        self.rate_limited.of(sent);
+    }
+}
+
+/// Snapshots on their way out.
+#[derive(Debug)]
+pub(crate) struct SnapshotStage {
+    publisher: Arc<Publisher>,
+    map: MapStream,
+    rate_limited: RateLimitedLog,
+}
+
+impl SnapshotStage {
+    /// `n_queued` snapshots wait behind it.
+    pub(crate) fn publish(&mut self, (snapshot, is_last): &SnapshotEvent, n_queued: usize) {
+        let map = &mut self.map;
+        let sent = map.publish(&self.publisher, snapshot, *is_last, n_queued);
+        self.rate_limited.of(sent);
+    }
+}
+
+/// Who publishes what; `streams_of` takes it apart again.
+pub(crate) fn stages_of(
+    publisher: &Arc<Publisher>,
+    streams: Streams,
+) -> (LiveStage, SnapshotStage) {
+    let live = LiveStage {
+        publisher: Arc::clone(publisher),
+        poses: streams.poses,
+        status: streams.status,
+        rate_limited: RateLimitedLog::default(),
+    };
+    let snapshots = SnapshotStage {
+        publisher: Arc::clone(publisher),
+        map: streams.map,
+        rate_limited: RateLimitedLog::default(),
+    };
+    (live, snapshots)
+}
+
+/// What goes on with the next map.
+pub(crate) fn streams_of(live: LiveStage, snapshots: SnapshotStage) -> Streams {
+    Streams {
+        map: snapshots.map,
+        poses: live.poses,
+        status: live.status,
     }
 }
 
 /// Runs until the tracker has ended.
-pub(crate) fn run_live(publisher: &Publisher, events: &Receiver<LiveEvent>) {
-    let mut rate_limited = RateLimitedLog::default();
+pub(crate) fn run_live(mut stage: LiveStage, events: &Receiver<LiveEvent>) -> LiveStage {
     let mut since_status = Stopwatch::start();
-    rate_limited.of(publisher.status(rss_mib()));
+    stage.send_status();
     loop {
         match events.recv_timeout(REPEAT) {
-            Received::Item(event) => rate_limited.of(send_event(publisher, &event)),
-            Received::Nothing => rate_limited.of(publisher.repeat_transforms()),
+            Received::Item(event) => stage.send_event(&event),
+            Received::Nothing => stage.repeat_transforms(),
             Received::Ended => break,
         }
         if since_status.secs() >= STATUS_SECS {
             since_status = Stopwatch::start();
-            rate_limited.of(publisher.status(rss_mib()));
+            stage.send_status();
         }
     }
-    rate_limited.of(publisher.status(rss_mib()));
+    stage.send_status();
+    stage
 }
 
 /// Runs until the map has ended.
-pub(crate) fn run_publisher(publisher: Option<&Publisher>, snapshots: &Receiver<SnapshotEvent>) {
-    let mut rate_limited = RateLimitedLog::default();
+pub(crate) fn run_publisher(
+    mut stage: Option<SnapshotStage>,
+    snapshots: &Receiver<SnapshotEvent>,
+) -> Option<SnapshotStage> {
     while let Some(outgoing) = snapshots.recv() {
-        if let Some(publisher) = publisher {
-            publish_snapshot(publisher, &outgoing, &mut rate_limited);
+        if let Some(stage) = &mut stage {
+            stage.publish(&outgoing, snapshots.len());
         }
     }
-}
-
-/// In sequence: publishes the events that have gathered.
-pub(crate) fn publish_events(
-    publisher: &Publisher,
-    events: &[LiveEvent],
-    rate_limited: &mut RateLimitedLog,
-) {
-    events
-        .iter()
-        .for_each(|event| rate_limited.of(send_event(publisher, event)));
-}
-
-pub(crate) fn publish_snapshot(
-    publisher: &Publisher,
-    outgoing: &SnapshotEvent,
-    rate_limited: &mut RateLimitedLog,
-) {
-    rate_limited.of(publish(publisher, outgoing));
-}
-
-fn publish(publisher: &Publisher, (snapshot, is_last): &SnapshotEvent) -> Result<(), PublishError> {
-    if *is_last {
-        publisher.publish_last(snapshot)
-    } else {
-        publisher.publish(snapshot)
-    }
+    stage
 }

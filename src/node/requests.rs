@@ -50,11 +50,6 @@ impl RequestHandler {
         &self.landmarks
     }
 
-    /// Those of the map before, where there are any.
-    pub(crate) fn keep_calls(&mut self, calls: Option<Calls<ServiceCall>>) {
-        self.calls = calls.or(self.calls.take());
-    }
-
     /// For the time after this map.
     pub(crate) fn take_calls(&mut self) -> Option<Calls<ServiceCall>> {
         self.calls.take()

@@ -39,8 +39,8 @@ mod joined {
     use crate::params::live::Live;
     use crate::params::settings::Settings;
     use splat_msgs::services::SERVICES;
+    use splat_ros::output::TOPICS;
     use splat_ros::publisher::Publisher;
-    use splat_ros::publisher::TOPICS;
     use splat_ros::ros2::lifecycle::Hands;
     use splat_ros::ros2::node::Link;
     use splat_ros::ros2::node::NODE_NAME;

@@ -116,7 +116,7 @@ pub fn finish(
     };
     let tracks = &outcome.tracking.tracks.frames;
     let keyframes = timed_keyframes(outcome);
-    let rows = frames::rows(&keyframes, tracks, &outcome.frame_stamps);
+    let rows = frames::rows(&keyframes, tracks, &outcome.input.frame_stamps);
     let report = Report {
         tracking: tracking_figures(&outcome.tracking, &rows),
         ..report(outcome, settings, quality)
@@ -142,6 +142,7 @@ fn write(
     let frames = frames::trajectory(rows);
     let live = frames::live_trajectory(&outcome.tracking.tracks.frames);
     let truth: Vec<TimedPose> = outcome
+        .input
         .truth
         .iter()
         .map(|(stamp, pose)| TimedPose {
@@ -196,9 +197,9 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
     let steps = outcome.map.n_steps();
     Report {
         version: env!("CARGO_PKG_VERSION").to_owned(),
-        frames: FrameCounts::of(&outcome.counts, outcome.n_dropped),
+        frames: FrameCounts::of(&outcome.input.counts, outcome.input.n_dropped),
         keyframes: KeyframeCounts {
-            selected: outcome.n_selected as u64,
+            selected: outcome.input.n_selected as u64,
             registered: outcome.own_poses().len() as u64,
             before: outcome.map.continuation().map_or(0, |c| c.keyframes as u64),
             submaps: outcome.map.submaps().len() as u64,
@@ -220,8 +221,8 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
         },
         steps_per_s: (steps > 0 && optimise > 0.0).then(|| steps as f64 / optimise),
         latency_ms: Latency::of(
-            &outcome.keyframe_to_pose_secs,
-            &outcome.keyframe_to_snapshot_secs,
+            &outcome.latency.to_pose_secs,
+            &outcome.latency.to_snapshot_secs,
             &outcome.tracking.latency_secs,
         ),
         tracking: TrackingFigures::default(),
@@ -239,7 +240,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             joined: c.is_joined,
         }),
         scale: snapshot.scale.into(),
-        source_fault: outcome.counts.fault.clone(),
+        source_fault: outcome.input.counts.fault.clone(),
         geometry_note: outcome.geometry_note.clone(),
         engine_faults: outcome.n_engine_faults,
         error: outcome.error.clone(),

@@ -1,12 +1,11 @@
 //! Input -> frames, as a stage: pause, reset and the end are decided here.
 
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use crate::node::stop::Stop;
 use splat_io::frame_source::{Polled, Source, SourceCounts};
-use splat_ros::publisher::Publisher;
+use splat_ros::output::OutputHandles;
 use splat_types::frame::Frame;
 use splat_types::time::Stopwatch;
 
@@ -16,21 +15,17 @@ const PATIENCE: Duration = Duration::from_millis(100);
 pub(crate) struct SourceStage {
     source: Box<dyn Source>,
     stop: Stop,
-    publisher: Option<Arc<Publisher>>,
+    output: Option<OutputHandles>,
     is_mounted: bool,
     pub(crate) decode_secs: f64,
 }
 
 impl SourceStage {
-    pub(crate) fn new(
-        source: Box<dyn Source>,
-        stop: Stop,
-        publisher: Option<Arc<Publisher>>,
-    ) -> Self {
+    pub(crate) fn new(source: Box<dyn Source>, stop: Stop, output: Option<OutputHandles>) -> Self {
         Self {
             source,
             stop,
-            publisher,
+            output,
             is_mounted: false,
             decode_secs: 0.0,
         }
@@ -44,7 +39,10 @@ impl SourceStage {
             if !matches!(polled, Polled::Waiting) {
                 self.decode_secs += watch.secs();
             }
-            let Some(publisher) = self.publisher.as_ref() else {
+            let Some(OutputHandles {
+                reports, controls, ..
+            }) = &self.output
+            else {
                 match polled {
                     Polled::Frame(frame) => return Some(*frame),
                     Polled::Ended => return None,
@@ -52,27 +50,32 @@ impl SourceStage {
                 }
             };
             let warnings = self.source.warnings();
-            publisher.note(|status| status.source_notes = warnings);
+            reports.source.update(|status| status.warnings = warnings);
             if let Polled::Frame(frame) = &polled {
                 if !self.is_mounted {
                     let mount = self.source.mount();
-                    publisher.set_camera(mount, self.source.camera_frame());
+                    let name = self.source.camera_frame();
+                    reports.camera.update(|camera| camera.update(mount, name));
                     self.is_mounted = mount.is_some();
                 }
-                publisher.note_image(self.source.counts(), frame.intrinsics.is_some());
+                let counts = self.source.counts();
+                reports.source.update(|status| {
+                    status.since_image = Stopwatch::start();
+                    status.counts = counts;
+                    status.is_calibrated = frame.intrinsics.is_some();
+                });
             }
-            let controls = publisher.controls();
             if controls.wants_reset.swap(false, Ordering::Relaxed) {
                 self.stop.ask_restart();
                 return None;
             }
             let is_paused = controls.is_paused.load(Ordering::Relaxed);
-            publisher.note(|status| status.is_paused = is_paused);
+            reports.source.update(|status| status.is_paused = is_paused);
             match polled {
                 Polled::Frame(frame) if !is_paused => return Some(*frame),
                 Polled::Frame(_) | Polled::Waiting => {}
                 Polled::Ended => {
-                    publisher.note(|status| status.has_ended = true);
+                    reports.source.update(|status| status.has_ended = true);
                     return None;
                 }
             }

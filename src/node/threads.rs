@@ -58,6 +58,7 @@ pub(crate) fn run_select(
     };
     while let Some(frame) = frames.recv() {
         report(received, &frame);
+        report_queues(&stage, frames, 0);
         if let Some(batch) = stage.push(frame)
             && !send(batch)
         {
@@ -70,6 +71,14 @@ pub(crate) fn run_select(
     stage
 }
 
+fn report_queues(stage: &SelectStage, frames: &Receiver<Frame>, n_batches: usize) {
+    stage.report(|status| {
+        status.n_dropped_frames = frames.dropped();
+        status.n_queued_frames = frames.len();
+        status.n_queued_batches = n_batches;
+    });
+}
+
 /// Live: batches go out when geometry takes them, and selection waits for nobody: keyframes gather until then.
 fn run_select_live(
     mut stage: SelectStage,
@@ -80,7 +89,10 @@ fn run_select_live(
     let mut full = VecDeque::new();
     loop {
         match frames.recv_timeout(LIVE_TICK) {
-            Received::Item(frame) => full.extend(stage.push(frame)),
+            Received::Item(frame) => {
+                full.extend(stage.push(frame));
+                report_queues(&stage, frames, full.len());
+            }
             Received::Nothing => {}
             Received::Ended => break,
         }

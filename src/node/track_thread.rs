@@ -48,9 +48,7 @@ pub(crate) struct TrackStage {
     tracker: Option<Tracker>,
     is_live: bool,
     said: TrackState,
-    secs: f64,
-    frame_secs: VecDeque<f64>,
-    latency_secs: VecDeque<f64>,
+    times: TrackTimes,
     /// Who keeps landmarks for a map file that is written while the run goes on, how often, and since when.
     saved_to: Option<(Sender<Vec<u8>>, f64, Stopwatch)>,
     /// How the map has moved under the camera since the last frame.
@@ -65,6 +63,14 @@ pub(crate) struct TrackStage {
     pub(crate) grace: ShutdownTimeout,
     /// Frames that had come before a stop and were left.
     n_left: u64,
+}
+
+/// What tracking took.
+#[derive(Debug, Default)]
+struct TrackTimes {
+    secs: f64,
+    frame_secs: VecDeque<f64>,
+    latency_secs: VecDeque<f64>,
 }
 
 /// What tracking leaves behind.
@@ -93,9 +99,7 @@ impl TrackStage {
             tracker,
             is_live,
             said: TrackState::Initialising,
-            secs: 0.0,
-            frame_secs: VecDeque::new(),
-            latency_secs: VecDeque::new(),
+            times: TrackTimes::default(),
             saved_to: None,
             moved: None,
             shown: None,
@@ -170,10 +174,10 @@ impl TrackStage {
         if let Some((client, placement)) = self.client.as_ref().zip(tracker.placement()) {
             client.ask(placement, frame);
         }
-        self.secs += watch.secs();
-        note(&mut self.frame_secs, watch.secs());
+        self.times.secs += watch.secs();
+        note(&mut self.times.frame_secs, watch.secs());
         if self.is_live && tracked.is_measured() {
-            note(&mut self.latency_secs, since.secs());
+            note(&mut self.times.latency_secs, since.secs());
         }
         self.say(&tracked);
         let moved = self.moved.take();
@@ -221,7 +225,7 @@ impl TrackStage {
             tracker.retry(usize::MAX);
         }
         self.save_if_due();
-        self.secs += watch.secs();
+        self.times.secs += watch.secs();
         if self.is_received {
             self.show(updates);
         }
@@ -248,7 +252,7 @@ impl TrackStage {
         let watch = Stopwatch::start();
         let tracker = self.tracker.as_mut();
         let n_looks = tracker.map_or(0, |tracker| tracker.retry(1));
-        self.secs += watch.secs();
+        self.times.secs += watch.secs();
         n_looks > 0
     }
 
@@ -266,9 +270,9 @@ impl TrackStage {
             }),
             tracks: tracks.unwrap_or_default(),
             n_dropped: n_dropped + self.n_left,
-            secs: self.secs + watch.secs(),
-            frame_secs: self.frame_secs.into(),
-            latency_secs: self.latency_secs.into(),
+            secs: self.times.secs + watch.secs(),
+            frame_secs: self.times.frame_secs.into(),
+            latency_secs: self.times.latency_secs.into(),
         }
     }
 

@@ -283,7 +283,7 @@ fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
             is_live: false,
             stop: Stop::default(),
             out: None,
-            publisher: None,
+            output: None,
             engines: Engines::default(),
         };
         let outcome = pipeline::run(job, &mut |_| {}).unwrap();
@@ -293,7 +293,7 @@ fn a_camera_unplugged_in_the_middle_of_a_run_leaves_the_same_map() {
             .iter()
             .map(|pose| pose.stamp)
             .collect();
-        (outcome.counts.interruptions, stamps, outcome.snapshot)
+        (outcome.input.counts.interruptions, stamps, outcome.snapshot)
     };
     let (none, expected_stamps, expected) = map(None);
     let (one, stamps, found) = map(Some(7));

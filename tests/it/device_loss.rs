@@ -124,7 +124,7 @@ fn job(params: Params, engines: Engines, out: &Path) -> Job {
         is_live: false,
         stop: Stop::default(),
         out: Some(out.to_owned()),
-        publisher: None,
+        output: None,
         engines,
     }
 }

@@ -21,8 +21,8 @@ use splat_msgs::ros::standard::Path;
 use splat_msgs::type_hash::dds_type_name;
 use splat_ros::error::PublishError;
 use splat_ros::odometry;
+use splat_ros::output::Output;
 use splat_ros::params::PublishParams;
-use splat_ros::publisher::Publisher;
 use splat_types::snapshot::Snapshot;
 use splat_types::time::Stopwatch;
 
@@ -94,6 +94,12 @@ pub fn ask(session: &Session, key: &str) -> Option<Snapshot> {
     None
 }
 
+fn publish(output: &mut Output, snapshot: &Arc<Snapshot>) {
+    let publisher = &output.handles.publisher;
+    let sent = output.streams.map.publish(publisher, snapshot, false, 0);
+    sent.unwrap();
+}
+
 pub fn free_endpoint() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     format!("tcp/{}", listener.local_addr().unwrap())
@@ -101,17 +107,15 @@ pub fn free_endpoint() -> String {
 
 #[test]
 fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
-    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-    let endpoints = publisher.endpoints();
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let endpoints = output.handles.publisher.endpoints();
     assert!(
         endpoints.len() == 1 && !endpoints[0].ends_with(":0"),
         "{endpoints:?}"
     );
-    publisher
-        .publish(&Arc::new(random_snapshot(10, 1, 1, 1)))
-        .unwrap();
+    publish(&mut output, &Arc::new(random_snapshot(10, 1, 1, 1)));
     let snapshot = Arc::new(random_snapshot(6000, 7, 1, 2));
-    publisher.publish(&snapshot).unwrap();
+    publish(&mut output, &snapshot);
 
     let session = client("", &endpoints[0]);
     let received = ask(&session, "0/splat_mapper/**").expect("no snapshot");
@@ -138,7 +142,7 @@ fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
         (reported.translation - last.translation).length() < 1e-9
             && reported.angle_to(&last) < 1e-9
     );
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
 }
 
 #[test]
@@ -153,8 +157,8 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
     params.zenoh_connect = endpoint;
     params.namespace = "robot/mapper".to_owned();
     params.domain_id = 7;
-    let publisher = Publisher::open(&params).unwrap();
-    assert!(publisher.endpoints().is_empty());
+    let mut output = Output::open(&params, None).unwrap();
+    assert!(output.handles.publisher.endpoints().is_empty());
     // Publishing begins when the peers know each other.
     let matching = session
         .liveliness()
@@ -188,7 +192,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
         .collect();
     let mut assembler = Assembler::new(MAX_BYTES);
     for snapshot in &snapshots {
-        publisher.publish(snapshot).unwrap();
+        publish(&mut output, snapshot);
         let received =
             std::iter::repeat_with(|| live.recv_timeout(PATIENCE).unwrap().expect("silence"))
                 .find_map(|sample| {
@@ -198,15 +202,15 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
                 });
         assert!(received.as_ref() == Some(&**snapshot));
     }
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
 }
 
 #[test]
 fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
-    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-    let session = client("", &publisher.endpoints()[0]);
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let session = client("", &output.handles.publisher.endpoints()[0]);
     let snapshot = Arc::new(random_snapshot(2000, 3, 1, 2));
-    publisher.publish(&snapshot).unwrap();
+    publish(&mut output, &snapshot);
     ask(&session, "0/splat_mapper/**").expect("no snapshot");
     for ix in 0..200_u32 {
         session
@@ -223,7 +227,7 @@ fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
         );
     }
     assert!(ask(&session, "0/splat_mapper/**").as_ref() == Some(&*snapshot));
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
 }
 
 /// A wire between a client and `endpoint` that can be stalled: bytes towards the client then stay where they are.
@@ -266,11 +270,11 @@ impl Wire {
 
 #[test]
 fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
-    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
-    let endpoint = publisher.endpoints().remove(0);
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let endpoint = output.handles.publisher.endpoints().remove(0);
     // 18 MB each: more than all buffers on the way hold.
     let snapshot = |revision| Arc::new(random_snapshot(60_000, 3, 3, revision));
-    publisher.publish(&snapshot(1)).unwrap();
+    publish(&mut output, &snapshot(1));
     let wire = Wire::new(&endpoint);
     let stuck = client("", &wire.endpoint);
     let _stuck_live = stuck
@@ -297,7 +301,7 @@ fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
         });
         [snapshot(2), snapshot(3), Arc::clone(&last)]
             .iter()
-            .for_each(|s| publisher.publish(s).unwrap());
+            .for_each(|s| publish(&mut output, s));
         receiver.join().unwrap()
     });
     assert!(received.as_ref() == Some(&*last));
@@ -308,7 +312,7 @@ fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
     );
     // zenoh lingers ten seconds over bytes that the stalled peer never took; we do not.
     let closing = Stopwatch::start();
-    let closed = publisher.close();
+    let closed = output.handles.publisher.close();
     assert!(
         closing.secs() < 2.5 && matches!(closed, Ok(()) | Err(PublishError::Close { .. })),
         "{closed:?}"
@@ -322,23 +326,23 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let mut params = params("");
     params.zenoh_connect = endpoint.clone();
     let started = Stopwatch::start();
-    let publisher = Publisher::open(&params).unwrap();
+    let mut output = Output::open(&params, None).unwrap();
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
-    publisher.publish(&snapshot).unwrap();
+    publish(&mut output, &snapshot);
     assert!(
         started.secs() < 5.0,
         "{} s with nobody there",
         started.secs()
     );
     assert!(ask(&client(&endpoint, ""), "0/splat_mapper/**").as_ref() == Some(&*snapshot));
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
 }
 
 #[test]
 fn close_without_peers_is_quick() {
-    let publisher = Publisher::open(&params("tcp/127.0.0.1:0")).unwrap();
+    let output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
     let started = Stopwatch::start();
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
     assert!(started.secs() < 2.0, "{} s", started.secs());
 }
 
@@ -353,15 +357,18 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     std::fs::write(&path, text).unwrap();
     let mut params = params("nonsense that nobody reads");
     params.zenoh_config = path.display().to_string();
-    let publisher = Publisher::open(&params).unwrap();
-    assert_eq!(publisher.endpoints(), std::slice::from_ref(&endpoint));
+    let mut output = Output::open(&params, None).unwrap();
+    assert_eq!(
+        output.handles.publisher.endpoints(),
+        std::slice::from_ref(&endpoint)
+    );
     let snapshot = Arc::new(random_snapshot(20, 1, 0, 1));
-    publisher.publish(&snapshot).unwrap();
+    publish(&mut output, &snapshot);
     assert!(ask(&client("", &endpoint), "0/splat_mapper/**").as_ref() == Some(&*snapshot));
-    publisher.close().unwrap();
+    output.handles.publisher.close().unwrap();
 
     std::fs::write(&path, "{ listen: ").unwrap();
-    let fault = Publisher::open(&params).unwrap_err().to_string();
+    let fault = Output::open(&params, None).unwrap_err().to_string();
     assert!(
         fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"),
         "{fault}"
@@ -370,7 +377,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
 
 #[test]
 fn errors_name_the_parameter() {
-    let message = |params: PublishParams| Publisher::open(&params).unwrap_err().to_string();
+    let message = |params: PublishParams| Output::open(&params, None).unwrap_err().to_string();
     for bad in ["nonsense", "tcp/127.0.0.1", "warp/127.0.0.1:7447"] {
         let found = message(params(bad));
         assert!(found.contains("zenoh_listen"), "{bad}: {found}");
@@ -384,7 +391,7 @@ fn errors_name_the_parameter() {
     // A port that is taken.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("tcp/{}", listener.local_addr().unwrap());
-    let fault = Publisher::open(&params(&taken)).unwrap_err();
+    let fault = Output::open(&params(&taken), None).unwrap_err();
     assert!(
         matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken),
         "{fault}"

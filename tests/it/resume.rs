@@ -120,7 +120,7 @@ fn map(frames: &[Frame], sets: &[&str]) -> Outcome {
         is_live: false,
         stop: Stop::default(),
         out: None,
-        publisher: None,
+        output: None,
         engines: Engines::default(),
     };
     let outcome = pipeline::run(job, &mut |_| ()).unwrap();

@@ -9,7 +9,7 @@ use crate::sfm::params;
 use splat_msgs::correction_message::MapCorrectionMsg;
 use splat_msgs::ros;
 use splat_ros::error::PublishError;
-use splat_ros::publisher::Publisher;
+use splat_ros::output::Output;
 use splat_ros::transport::{Sample, Transport};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::snapshot::Snapshot;
@@ -32,13 +32,21 @@ impl Transport for Kept {
     }
 }
 
-fn publisher() -> (Publisher, Sent) {
+fn output() -> (Output, Sent) {
     let sent = Sent::default();
-    let publisher = Publisher::open(&params(&[]).publish).unwrap();
-    (
-        publisher.with_transport(Box::new(Kept(Arc::clone(&sent)))),
-        sent,
-    )
+    let kept = Kept(Arc::clone(&sent));
+    let output = Output::open(&params(&[]).publish, Some(Box::new(kept)));
+    (output.unwrap(), sent)
+}
+
+fn publish(output: &mut Output, snapshot: &Arc<Snapshot>) {
+    let publisher = &output.handles.publisher;
+    let sent = output.streams.map.publish(publisher, snapshot, false, 0);
+    sent.unwrap();
+}
+
+fn queue(output: &Output, correction: MapCorrection) {
+    output.handles.reports.correction.add(correction);
 }
 
 fn snapshot(revision: u32, epoch: u32) -> Arc<Snapshot> {
@@ -76,14 +84,14 @@ fn corrections(sent: &Sent) -> Vec<MapCorrectionMsg> {
 
 #[test]
 fn a_correction_goes_out_once_with_the_first_snapshot_that_shows_it() {
-    let (publisher, sent) = publisher();
-    publisher.publish(&snapshot(1, 0)).unwrap();
+    let (mut output, sent) = output();
+    publish(&mut output, &snapshot(1, 0));
     assert!(corrections(&sent).is_empty());
-    publisher.queue_correction(moved(1, 3));
+    queue(&output, moved(1, 3));
     // The map's thread was ahead.
-    publisher.publish(&snapshot(2, 0)).unwrap();
+    publish(&mut output, &snapshot(2, 0));
     assert!(corrections(&sent).is_empty());
-    publisher.publish(&snapshot(3, 1)).unwrap();
+    publish(&mut output, &snapshot(3, 1));
     let found = corrections(&sent);
     assert_eq!(found.len(), 1);
     assert_eq!(found[0].header.frame_id, "splat_map");
@@ -92,18 +100,18 @@ fn a_correction_goes_out_once_with_the_first_snapshot_that_shows_it() {
     assert_eq!([t.x, t.y, t.z, found[0].scale], [1.0, 2.0, 3.0, 1.5]);
     assert_eq!((found[0].translation, found[0].rotation_rad), (0.7, 0.3));
     assert_eq!(found[0].reason, 0);
-    publisher.publish(&snapshot(4, 1)).unwrap();
+    publish(&mut output, &snapshot(4, 1));
     assert!(corrections(&sent).is_empty());
 }
 
 #[test]
 fn corrections_of_snapshots_that_nobody_saw_are_sent_as_one() {
-    let (publisher, sent) = publisher();
-    publisher.publish(&snapshot(1, 0)).unwrap();
+    let (mut output, sent) = output();
+    publish(&mut output, &snapshot(1, 0));
     assert!(corrections(&sent).is_empty());
-    publisher.queue_correction(moved(1, 2));
-    publisher.queue_correction(moved(2, 3));
-    publisher.publish(&snapshot(3, 2)).unwrap();
+    queue(&output, moved(1, 2));
+    queue(&output, moved(2, 3));
+    publish(&mut output, &snapshot(3, 2));
     let found = corrections(&sent);
     assert_eq!(found.len(), 1);
     assert!((found[0].scale - 2.25).abs() < 1e-12);
@@ -113,13 +121,13 @@ fn corrections_of_snapshots_that_nobody_saw_are_sent_as_one() {
 #[test]
 fn a_map_that_takes_the_place_of_another_says_why() {
     for (is_loaded, code) in [(false, 2), (true, 3)] {
-        let (publisher, sent) = publisher();
-        publisher.publish(&snapshot(5, 2)).unwrap();
-        publisher.queue_correction(MapCorrection::restart(is_loaded));
+        let (mut output, sent) = output();
+        publish(&mut output, &snapshot(5, 2));
+        queue(&output, MapCorrection::restart(is_loaded));
         let mut other = random_snapshot(20, 3, 0, 1);
         other.map_id[0] ^= 1;
         sent.lock().unwrap().clear();
-        publisher.publish(&Arc::new(other)).unwrap();
+        publish(&mut output, &Arc::new(other));
         let found = corrections(&sent);
         assert_eq!(found.len(), 1, "is_loaded {is_loaded}");
         assert_eq!(found[0].reason, code);
@@ -129,12 +137,15 @@ fn a_map_that_takes_the_place_of_another_says_why() {
 
 #[test]
 fn a_merge_that_moves_nothing_begins_no_epoch_and_is_not_sent() {
-    let (publisher, sent) = publisher();
-    publisher.publish(&snapshot(1, 0)).unwrap();
-    publisher.queue_correction(MapCorrection {
-        revision: 2,
-        ..MapCorrection::identity(Reason::Merge)
-    });
-    publisher.publish(&snapshot(2, 0)).unwrap();
+    let (mut output, sent) = output();
+    publish(&mut output, &snapshot(1, 0));
+    queue(
+        &output,
+        MapCorrection {
+            revision: 2,
+            ..MapCorrection::identity(Reason::Merge)
+        },
+    );
+    publish(&mut output, &snapshot(2, 0));
     assert!(corrections(&sent).is_empty());
 }

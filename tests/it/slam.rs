@@ -67,7 +67,7 @@ fn pushed_frames_make_the_map_of_the_node() {
         is_live: false,
         stop: Stop::default(),
         out: None,
-        publisher: None,
+        output: None,
         engines: Engines::of(|_, _| Ok(Box::new(CpuEngine::new()))),
     };
     let node = pipeline::run(job, &mut |_| ()).unwrap();

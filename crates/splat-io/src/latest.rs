@@ -16,12 +16,21 @@ impl<T> Latest<T> {
     }
 
     pub fn get(&self) -> Arc<T> {
-        // The value is exchanged whole: a panic leaves the old one.
+        // A panic in the middle of a change leaves a value that can be shown.
         Arc::clone(&self.value.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     pub fn set(&self, value: T) {
         *self.value.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(value);
+    }
+
+    /// Replaces a part of the value; who has the old one keeps it.
+    pub fn update(&self, change: impl FnOnce(&mut T))
+    where
+        T: Clone,
+    {
+        let mut value = self.value.lock().unwrap_or_else(PoisonError::into_inner);
+        change(Arc::make_mut(&mut value));
     }
 }
 
@@ -35,5 +44,8 @@ mod tests {
         let first = cell.get();
         cell.set(2);
         assert_eq!((*first, *cell.get()), (1, 2));
+        let second = cell.get();
+        cell.update(|value| *value += 3);
+        assert_eq!((*second, *cell.get()), (2, 5));
     }
 }

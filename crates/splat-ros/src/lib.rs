@@ -6,8 +6,6 @@ pub mod transport;
 
 pub mod latched;
 
-pub mod map_stream;
-
 pub mod params;
 
 pub mod navigation;
@@ -22,8 +20,6 @@ pub mod odometry;
 
 pub mod pose_messages;
 
-mod pose_stream;
-
 pub mod render_view;
 
 pub mod service_server;
@@ -32,5 +28,15 @@ pub mod service_server;
 pub mod zenoh;
 
 pub mod publisher;
+
+pub mod reports;
+
+pub mod map_stream;
+
+pub mod pose_stream;
+
+pub mod status_stream;
+
+pub mod output;
 
 pub mod ros2;

@@ -5,12 +5,22 @@
 
 use std::sync::Arc;
 
-use crate::transport::{Delivery, Topic};
-use splat_msgs::correction_message::MapCorrectionMsg;
+use crate::error::PublishError;
+use crate::latched::{KEYFRAMES, MANIFEST, SPLATS};
+use crate::navigation::{self, CLOUD, FRUSTA, PATH};
+use crate::odometry::FrameCells;
+use crate::params::PublishParams;
+use crate::publisher::Publisher;
+use crate::reports::Reports;
+use crate::status::PublishedStatus;
+use crate::transport::{Delivery, Sample, Topic};
+use splat_msgs::correction_message::{self, MapCorrectionMsg};
 use splat_msgs::map_messages::{MAX_MESSAGE_BYTES, Messages, SplatDelta, splats_per_message};
 use splat_types::snapshot::Snapshot;
 use splat_types::splats::layout;
 use splat_types::splats::splats::{SH_C0, Splats};
+use splat_types::time::Stopwatch;
+use splat_types::transform::Similarity;
 
 /// Change below it is not seen: in standard deviations of the splat, or steps of a 0 to 1 colour times two, each
 /// weighed by the splat's opacity.
@@ -19,6 +29,18 @@ const MIN_CHANGE: f32 = 0.02;
 pub static CORRECTION: Topic =
     Topic::of::<MapCorrectionMsg>("correction", Delivery::Latched { depth: 10 });
 pub static DELTA: Topic = Topic::of::<SplatDelta>("splats/delta", Delivery::Reliable { depth: 64 });
+
+/// What changes with every snapshot; owned by the thread that publishes them.
+#[derive(Debug)]
+pub struct MapStream {
+    params: PublishParams,
+    published: PublishedMap,
+    since_whole: Option<Stopwatch>,
+    /// The newest snapshot that was to go out.
+    last: Option<Arc<Snapshot>>,
+    reports: Arc<Reports>,
+    frames: Arc<FrameCells>,
+}
 
 /// What clients are to receive of a snapshot.
 #[derive(Debug)]
@@ -47,6 +69,110 @@ pub struct PublishedMap {
 struct Candidate {
     change: f32,
     new_ix: usize,
+}
+
+impl MapStream {
+    pub(crate) fn new(
+        params: &PublishParams,
+        reports: Arc<Reports>,
+        frames: Arc<FrameCells>,
+    ) -> Self {
+        Self {
+            params: params.clone(),
+            published: PublishedMap::default(),
+            since_whole: None,
+            last: None,
+            reports,
+            frames,
+        }
+    }
+
+    /// Sends a snapshot: what changed since the one before, or the whole of it, as the last one always goes out; `n_queued`
+    /// snapshots wait behind it. Returns when the transports have taken it.
+    pub fn publish(
+        &mut self,
+        publisher: &Publisher,
+        snapshot: &Arc<Snapshot>,
+        is_last: bool,
+        n_queued: usize,
+    ) -> Result<(), PublishError> {
+        self.frames
+            .set_metres_per_unit(snapshot.scale.metres_per_unit);
+        let map_from_world = self.frames.tree().map_from_world();
+        self.reports.published.set(PublishedStatus {
+            map_id: snapshot.map_id,
+            epoch: snapshot.epoch,
+            revision: snapshot.revision,
+            scale: snapshot.scale,
+            n_queued,
+        });
+        let last = self.last.replace(Arc::clone(snapshot));
+        let correction = last.and_then(|last| self.reports.correction.take(&last, snapshot));
+        let is_due = self
+            .since_whole
+            .is_none_or(|watch| watch.secs() >= self.params.full_map_period);
+        let is_whole = is_last || is_due;
+        let update = self
+            .published
+            .update(snapshot, is_whole, self.params.delta_share);
+        let held = self.published.held().map_or(snapshot, |held| held);
+        // Before the first message goes out: who subscribed too late for it finds it there.
+        let latched = publisher.latched();
+        let kept = latched.keep_map(held);
+        if let Some(correction) = correction {
+            let frame = latched.splat_frame();
+            let message = correction_message::message(&correction, snapshot, frame);
+            publisher.send(&Sample::of(&CORRECTION, snapshot.stamp, &message)?)?;
+        }
+        update.send(publisher, &latched.messages(&kept))?;
+        self.send_navigation(publisher, snapshot, &map_from_world)?;
+        if matches!(update, Update::Whole) {
+            self.since_whole = Some(Stopwatch::start());
+        }
+        Ok(())
+    }
+
+    /// What planners and displays take: trajectory, points and cameras in the map frame.
+    fn send_navigation(
+        &self,
+        publisher: &Publisher,
+        snapshot: &Snapshot,
+        map_from_world: &Similarity,
+    ) -> Result<(), PublishError> {
+        let stamp = snapshot.stamp;
+        let path = navigation::path(snapshot, map_from_world, &self.params);
+        publisher.send(&Sample::of(&PATH, stamp, &path)?)?;
+        let cloud = navigation::cloud(snapshot, map_from_world, &self.params);
+        publisher.send(&Sample::of(&CLOUD, stamp, &cloud)?)?;
+        let frusta = navigation::frusta(snapshot, map_from_world, &self.params);
+        publisher.send(&Sample::of(&FRUSTA, stamp, &frusta)?)
+    }
+}
+
+impl Update {
+    /// `messages` are those of the published map that the update has led to.
+    fn send(&self, publisher: &Publisher, messages: &Messages<'_>) -> Result<(), PublishError> {
+        let stamp = messages.snapshot.stamp;
+        if let Self::Whole = self {
+            publisher.send(&Sample::of(&MANIFEST, stamp, &messages.manifest())?)?;
+        }
+        for array in messages.keyframes() {
+            publisher.send(&Sample::of(&KEYFRAMES, stamp, &array)?)?;
+        }
+        match self {
+            Self::Whole => {
+                for chunk in messages.chunks() {
+                    publisher.send(&Sample::of(&SPLATS, stamp, &chunk)?)?;
+                }
+            }
+            Self::Delta(delta) => {
+                for piece in delta.messages(messages) {
+                    publisher.send(&Sample::of(&DELTA, stamp, &piece)?)?;
+                }
+            }
+        }
+        Ok(())
+    }
 }
 
 impl PublishedMap {

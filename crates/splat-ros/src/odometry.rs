@@ -3,6 +3,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix3, Matrix6};
 
+use splat_io::latest::Latest;
 use splat_types::covariance::Covariance;
 use splat_types::time::Stamp;
 use splat_types::tracking::{TrackState, TrackedFrame};
@@ -45,7 +46,7 @@ pub fn parse_transform(text: &str) -> Option<Rigid> {
 /// Where the splats' frame lies in the map frame: fixed by the first frame that was seen in both.
 #[derive(Debug, Clone, Default)]
 pub struct FrameTree {
-    /// (world_from_cam, world_from_cam) of that frame.
+    /// (world_from_cam, map_from_cam) of that frame.
     anchor: Option<(Rigid, Rigid)>,
     /// Metres of one unit of the splats; `None` while unknown, when both frames share one unit.
     pub metres_per_unit: Option<f64>,
@@ -71,6 +72,36 @@ impl FrameTree {
             rotation,
             translation: map_from_cam.translation - rotation * world_from_cam.translation * scale,
         }
+    }
+}
+
+/// What a `FrameTree` is made of, for threads that share it; each cell has one writer.
+#[derive(Debug, Default)]
+pub struct FrameCells {
+    /// Written once, by the thread that follows the tracker.
+    anchor: Latest<Option<(Rigid, Rigid)>>,
+    /// Written with every snapshot that goes out.
+    metres_per_unit: Latest<Option<f64>>,
+}
+
+impl FrameCells {
+    /// The frames as they lie now.
+    pub fn tree(&self) -> FrameTree {
+        FrameTree {
+            anchor: *self.anchor.get(),
+            metres_per_unit: *self.metres_per_unit.get(),
+        }
+    }
+
+    /// Takes over the anchor of a tree that its reader has anchored; the first one stays.
+    pub fn keep_anchor(&self, tree: &FrameTree) {
+        if tree.is_anchored() && self.anchor.get().is_none() {
+            self.anchor.set(tree.anchor);
+        }
+    }
+
+    pub fn set_metres_per_unit(&self, metres: Option<f64>) {
+        self.metres_per_unit.set(metres);
     }
 }
 

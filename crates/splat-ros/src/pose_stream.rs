@@ -1,42 +1,140 @@
-//! What the poses that go out remember from one frame to the next: odometry, the limited correction, the newest pose.
+//! Tracked frames -> pose, odometry and transforms of the robot; keyframes -> clouds for costmaps. Owned by one thread.
 
-use crate::odometry::{Odometer, RobotPose};
+use std::sync::Arc;
+
+use crate::error::PublishError;
+use crate::navigation::{self, KEYFRAME_CLOUD, KeyframeDepth};
+use crate::odometry::{FrameCells, Odometer, PoseEvent, RobotPose, parse_transform};
 use crate::params::PublishParams;
+use crate::pose_messages::LiveMessages;
+use crate::publisher::Publisher;
+use crate::reports::Reports;
 use crate::slew::CorrectionLimiter;
+use crate::transport::Sample;
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
 
+/// Seconds that transforms go on after the last frame.
+const MAX_REPEAT_SECS: f64 = 1.0;
+
 /// What changes with every frame.
 #[derive(Debug)]
-pub(crate) struct PoseStream {
-    pub(crate) odometer: Odometer,
+pub struct PoseStream {
+    messages: LiveMessages,
+    odometer: Odometer,
     slew: CorrectionLimiter,
-    pub(crate) newest: Option<Newest>,
+    newest: Option<Newest>,
+    /// Of the parameters, where the input names none.
+    camera_frame: String,
+    reports: Arc<Reports>,
+    frames: Arc<FrameCells>,
+}
+
+/// What the newest tracked frame said, for repeats of its transforms.
+#[derive(Debug, Clone, Copy)]
+struct Newest {
+    at: RobotPose,
+    since: Stopwatch,
 }
 
 impl PoseStream {
     /// `mount` is `base_from_cam` of the parameters.
-    pub(crate) fn new(mount: Option<Rigid>, params: &PublishParams) -> Self {
+    pub(crate) fn new(
+        mount: Option<Rigid>,
+        params: &PublishParams,
+        reports: Arc<Reports>,
+        frames: Arc<FrameCells>,
+    ) -> Self {
         Self {
+            messages: LiveMessages::new(params),
             odometer: Odometer::new(mount),
             slew: slew_of(params),
             newest: None,
+            camera_frame: params.camera_frame.clone(),
+            reports,
+            frames,
         }
     }
 
+    /// Sends what a tracked frame says.
+    pub fn live(&mut self, publisher: &Publisher, frame: &PoseEvent) -> Result<(), PublishError> {
+        if let Some(mount) = self.reports.camera.get().base_from_cam {
+            self.odometer.mount_by_input(mount);
+        }
+        let mut world = self.frames.tree();
+        let at = self.odometer.advance(frame, &mut world);
+        self.frames.keep_anchor(&world);
+        let Some(at) = at else {
+            return Ok(());
+        };
+        let map_from_odom = self.slewed(&at, at.stamp);
+        publisher.send(&self.messages.pose(&at)?)?;
+        publisher.send(&self.messages.odometry(&at)?)?;
+        let transforms = self
+            .messages
+            .transforms(&map_from_odom, &at, at.stamp, &world)?;
+        self.newest = Some(Newest {
+            at,
+            since: Stopwatch::start(),
+        });
+        transforms.map_or(Ok(()), |post| publisher.send(&post))
+    }
+
+    /// Between frames: the newest transforms once more, so that nobody has to look back further than they like.
+    pub fn repeat_transforms(&mut self, publisher: &Publisher) -> Result<(), PublishError> {
+        let Some(Newest { at, since }) = self.newest else {
+            return Ok(());
+        };
+        let secs = since.secs();
+        if secs > MAX_REPEAT_SECS {
+            return Ok(());
+        }
+        let nanos = at.stamp.nanos.saturating_add((secs * 1e9) as i64);
+        let stamp = Stamp::from_nanos(nanos);
+        let map_from_odom = self.slewed(&at, stamp);
+        let world = self.frames.tree();
+        let post = self
+            .messages
+            .transforms(&map_from_odom, &at, stamp, &world)?;
+        post.map_or(Ok(()), |post| publisher.send(&post))
+    }
+
+    /// Sends a keyframe's depth as costmaps take it.
+    pub fn keyframe(
+        &self,
+        publisher: &Publisher,
+        seen: &KeyframeDepth,
+    ) -> Result<(), PublishError> {
+        let metres = self.frames.tree().metres_per_unit.unwrap_or(1.0);
+        let camera = self.reports.camera.get();
+        let frame = if camera.frame.is_empty() {
+            &self.camera_frame
+        } else {
+            &camera.frame
+        };
+        let cloud = navigation::keyframe_cloud(seen, metres, frame);
+        publisher.send(&Sample::of(&KEYFRAME_CLOUD, seen.stamp, &cloud)?)
+    }
+
     /// `map_from_odom` as navigation is to see it.
-    pub(crate) fn slewed(&mut self, at: &RobotPose, stamp: Stamp) -> Rigid {
+    fn slewed(&mut self, at: &RobotPose, stamp: Stamp) -> Rigid {
         let robot = at.odom_from_base.translation;
         let slewed = self.slew.follow(&at.map_from_odom(), robot, stamp);
         slewed.map_from_odom
     }
 }
 
-/// What the newest tracked frame said, for repeats of its transforms.
-#[derive(Debug)]
-pub(crate) struct Newest {
-    pub(crate) at: RobotPose,
-    pub(crate) since: Stopwatch,
+/// `base_from_cam` of the parameters; `None` where they leave it to the input.
+pub(crate) fn mount_of(params: &PublishParams) -> Result<Option<Rigid>, PublishError> {
+    if params.base_from_camera.is_empty() {
+        return Ok(None);
+    }
+    let mount = parse_transform(&params.base_from_camera);
+    mount.map(Some).ok_or_else(|| PublishError::Param {
+        name: "mount",
+        found: params.base_from_camera.clone(),
+        expected: "seven numbers, x y z qx qy qz qw".to_owned(),
+    })
 }
 
 /// No limit where corrections are to show at once.

@@ -1,10 +1,10 @@
 //! The service `render_view`: its question -> a camera in the splat frame, a rendering -> its reply.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::odometry::FrameTree;
+use crate::odometry::FrameCells;
 use splat_msgs::ros::{CameraInfo, Header, Image, Pose};
 use splat_types::camera::Intrinsics;
 use splat_types::rendering::Rendering;
@@ -36,7 +36,7 @@ pub struct Frames {
     /// Name of the splats' own frame.
     pub splats: String,
     /// How they lie to each other.
-    pub world: Arc<Mutex<FrameTree>>,
+    pub cells: Arc<FrameCells>,
 }
 
 /// A camera to render from.
@@ -62,8 +62,7 @@ impl Frames {
         let (world_from_cam, scale) = if frame.is_empty() || frame == self.splats {
             (pose, 1.0)
         } else if frame == self.map {
-            let world = self.world.lock().unwrap_or_else(PoisonError::into_inner);
-            let map_from_world = world.map_from_world();
+            let map_from_world = self.cells.tree().map_from_world();
             (
                 map_from_world.inverse().transform_pose(&pose),
                 map_from_world.scale,
@@ -157,15 +156,17 @@ mod tests {
     use super::*;
 
     fn frames() -> Frames {
-        let mut world = FrameTree::default();
-        world.metres_per_unit = Some(2.0);
+        let cells = FrameCells::default();
+        cells.set_metres_per_unit(Some(2.0));
+        let mut world = cells.tree();
         let world_from_cam = Rigid::exp(DVec3::new(0.3, -0.2, 0.9), DVec3::new(0.1, 0.7, -0.2));
         let map_from_cam = Rigid::exp(DVec3::new(4.0, 2.0, 0.3), DVec3::new(0.0, 0.1, 0.2));
         world.anchor(world_from_cam, map_from_cam);
+        cells.keep_anchor(&world);
         Frames {
             map: "map".to_owned(),
             splats: "splat_map".to_owned(),
-            world: Arc::new(Mutex::new(world)),
+            cells: Arc::new(cells),
         }
     }
 
@@ -199,7 +200,7 @@ mod tests {
     #[test]
     fn the_same_camera_in_map_and_splat_frame_renders_from_the_same_place() {
         let frames = frames();
-        let map_from_world = frames.world.lock().unwrap().map_from_world();
+        let map_from_world = frames.cells.tree().map_from_world();
         let in_map = map_from_world.transform_pose(&pose());
         let found = frames.view(&asked("map", in_map)).unwrap().world_from_cam;
         assert!(found.translation.distance(pose().translation) < 1e-9);

@@ -1,4 +1,4 @@
-//! How the mapper stands -> its status message and diagnostics.
+//! How the stages stand, one struct for each that writes -> the status message and diagnostics.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,7 @@ use splat_msgs::ros::Header;
 use splat_msgs::ros::standard::{DiagnosticArray, DiagnosticStatus, KeyValue};
 use splat_msgs::status_message::MapperStatus;
 use splat_types::snapshot::Scale;
-use splat_types::time::Stamp;
+use splat_types::time::{Stamp, Stopwatch};
 use splat_types::tracking::TrackState;
 
 pub static STATUS: Topic = Topic::of::<MapperStatus>("status", Delivery::Latched { depth: 1 });
@@ -45,47 +45,97 @@ impl Times {
     }
 }
 
-/// What all stages say of themselves; each writes its own part.
+/// What the source says of the input.
+#[derive(Debug, Clone)]
+pub struct SourceStatus {
+    pub counts: SourceCounts,
+    /// Since the last image came; before the first, since the start.
+    pub since_image: Stopwatch,
+    pub is_calibrated: bool,
+    pub is_paused: bool,
+    pub has_ended: bool,
+    /// A line each, for example that a camera is gone.
+    pub warnings: Vec<String>,
+}
+
+impl Default for SourceStatus {
+    fn default() -> Self {
+        Self {
+            counts: SourceCounts::default(),
+            since_image: Stopwatch::start(),
+            is_calibrated: false,
+            is_paused: false,
+            has_ended: false,
+            warnings: Vec::new(),
+        }
+    }
+}
+
+/// What selection says of what it has taken and of what waits for it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct SelectStatus {
+    pub n_keyframes: u64,
+    /// Frames that made room for newer ones before selection looked at them.
+    pub n_dropped_frames: u64,
+    pub n_queued_frames: usize,
+    /// Batches that wait for geometry.
+    pub n_queued_batches: usize,
+}
+
+/// What tracked frames add up to.
 #[derive(Debug, Clone, Default)]
-pub struct Status {
-    pub map_id: [u8; 16],
-    pub epoch: u32,
-    pub revision: u32,
+pub struct TrackStatus {
     /// Of the newest frame that was looked at.
     pub stamp: Stamp,
-    pub counts: SourceCounts,
-    pub n_dropped: u64,
     /// `None` before the first frame.
-    pub tracked: Option<TrackState>,
+    pub state: Option<TrackState>,
     pub reason: String,
     pub n_tracked: u64,
     pub n_missed: u64,
-    pub n_selected: u64,
+    pub frame_to_pose: Times,
+}
+
+/// What the map thread says of the map that it works on.
+#[derive(Debug, Clone, Default)]
+pub struct MapStatus {
     pub n_registered: u64,
     pub n_submaps: u64,
     pub n_splats: u64,
     pub n_steps: u64,
     pub steps_per_s: f64,
     pub gpu_bytes: u64,
-    pub frame_to_pose: Times,
     pub keyframe_to_pose: Times,
-    pub queued: [u32; 3],
-    pub scale: Scale,
-    pub is_calibrated: bool,
-    pub is_paused: bool,
     /// Why the map is being put on another engine.
     pub recovering: Option<String>,
-    pub has_ended: bool,
-    /// What the input says of itself, for example that a camera is gone.
-    pub source_notes: Vec<String>,
 }
 
-impl Status {
+/// Which snapshot was the last to go out.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PublishedStatus {
+    pub map_id: [u8; 16],
+    pub epoch: u32,
+    pub revision: u32,
+    pub scale: Scale,
+    /// Snapshots that wait behind it.
+    pub n_queued: usize,
+}
+
+/// What all stages say at one moment.
+#[derive(Debug, Clone, Copy)]
+pub struct Status<'a> {
+    pub source: &'a SourceStatus,
+    pub select: &'a SelectStatus,
+    pub track: &'a TrackStatus,
+    pub map: &'a MapStatus,
+    pub published: &'a PublishedStatus,
+}
+
+impl Status<'_> {
     fn state(&self) -> u8 {
-        match self.tracked {
-            _ if self.has_ended => 5,
-            _ if self.is_paused => 4,
-            _ if self.recovering.is_some() => RECOVERING,
+        match self.track.state {
+            _ if self.source.has_ended => 5,
+            _ if self.source.is_paused => 4,
+            _ if self.map.recovering.is_some() => RECOVERING,
             None | Some(TrackState::Initialising) => 0,
             Some(TrackState::Tracking) => 1,
             Some(TrackState::Lost) => 2,
@@ -95,64 +145,68 @@ impl Status {
 
     /// What keeps the mapper from working well.
     pub fn warnings(&self, silent_secs: f64) -> Vec<String> {
-        let mut warnings = self.source_notes.clone();
-        let runs = !self.has_ended && !self.is_paused;
+        let source = self.source;
+        let mut warnings = source.warnings.clone();
+        let runs = !source.has_ended && !source.is_paused;
         if runs && silent_secs > SLOW_SECS {
-            warnings.push(if self.counts.received == 0 {
+            warnings.push(if source.counts.received == 0 {
                 format!("no image has come for {silent_secs:.0} s: is the camera on, and is it this topic?")
             } else {
                 format!("no image for {silent_secs:.0} s")
             });
         }
-        if let Some(fault) = &self.counts.fault {
+        if let Some(fault) = &source.counts.fault {
             warnings.push(fault.clone());
         }
-        if self.n_registered > 0 && self.scale.metres_per_unit.is_none() {
+        if self.map.n_registered > 0 && self.published.scale.metres_per_unit.is_none() {
             warnings.push(
                 "lengths are up to scale: no odometry, depth, camera height or baseline is known"
                     .to_owned(),
             );
         }
-        if self.counts.received > 0 && !self.is_calibrated {
+        if source.counts.received > 0 && !source.is_calibrated {
             warnings.push("the camera is uncalibrated: its focal length is estimated".to_owned());
         }
-        if self.n_submaps > 1 {
-            let n = self.n_submaps;
+        if self.map.n_submaps > 1 {
+            let n = self.map.n_submaps;
             warnings.push(format!("{n} parts of the input do not hang together"));
         }
         warnings
     }
 
     pub fn message(&self, frame: &str, rss_mib: Option<f64>, silent_secs: f64) -> MapperStatus {
-        let (scale_source, metres_per_unit, scale_std) = self.scale.to_numbers();
+        let (select, track) = (self.select, self.track);
+        let (map, published) = (self.map, self.published);
+        let counts = &self.source.counts;
+        let (scale_source, metres_per_unit, scale_std) = published.scale.to_numbers();
         MapperStatus {
-            header: Header::new(self.stamp, frame),
-            map_id: self.map_id,
-            epoch: self.epoch,
-            revision: self.revision,
+            header: Header::new(track.stamp, frame),
+            map_id: published.map_id,
+            epoch: published.epoch,
+            revision: published.revision,
             state: self.state(),
-            reason: self.recovering.as_ref().unwrap_or(&self.reason).clone(),
-            frames_received: self.counts.received,
-            frames_dropped: self.n_dropped + self.counts.dropped,
-            frames_undecodable: self.counts.undecodable,
-            frames_out_of_order: self.counts.out_of_order,
-            frames_tracked: self.n_tracked,
-            frames_lost: self.n_missed,
-            keyframes_selected: self.n_selected as u32,
-            keyframes_registered: self.n_registered as u32,
-            submaps: self.n_submaps as u32,
-            splats: self.n_splats as u32,
-            steps: self.n_steps,
-            steps_per_s: self.steps_per_s as f32,
-            frame_to_pose_p50_ms: self.frame_to_pose.percentile_ms(0.5),
-            frame_to_pose_p95_ms: self.frame_to_pose.percentile_ms(0.95),
-            keyframe_to_pose_p50_ms: self.keyframe_to_pose.percentile_ms(0.5),
-            keyframe_to_pose_p95_ms: self.keyframe_to_pose.percentile_ms(0.95),
+            reason: map.recovering.as_ref().unwrap_or(&track.reason).clone(),
+            frames_received: counts.received,
+            frames_dropped: select.n_dropped_frames + counts.dropped,
+            frames_undecodable: counts.undecodable,
+            frames_out_of_order: counts.out_of_order,
+            frames_tracked: track.n_tracked,
+            frames_lost: track.n_missed,
+            keyframes_selected: select.n_keyframes as u32,
+            keyframes_registered: map.n_registered as u32,
+            submaps: map.n_submaps as u32,
+            splats: map.n_splats as u32,
+            steps: map.n_steps,
+            steps_per_s: map.steps_per_s as f32,
+            frame_to_pose_p50_ms: track.frame_to_pose.percentile_ms(0.5),
+            frame_to_pose_p95_ms: track.frame_to_pose.percentile_ms(0.95),
+            keyframe_to_pose_p50_ms: map.keyframe_to_pose.percentile_ms(0.5),
+            keyframe_to_pose_p95_ms: map.keyframe_to_pose.percentile_ms(0.95),
             rss_mib: rss_mib.map_or(f32::NAN, |mib| mib as f32),
-            gpu_mib: (self.gpu_bytes as f64 / MIB) as f32,
-            frames_queued: self.queued[0],
-            batches_queued: self.queued[1],
-            snapshots_queued: self.queued[2],
+            gpu_mib: (map.gpu_bytes as f64 / MIB) as f32,
+            frames_queued: select.n_queued_frames as u32,
+            batches_queued: select.n_queued_batches as u32,
+            snapshots_queued: published.n_queued as u32,
             scale_source,
             metres_per_unit,
             scale_std,
@@ -261,22 +315,37 @@ mod tests {
 
     #[test]
     fn diagnostics_give_a_camera_that_stops_from_one_that_runs() {
-        let status = Status {
-            tracked: Some(TrackState::Tracking),
+        let track = TrackStatus {
+            state: Some(TrackState::Tracking),
+            ..TrackStatus::default()
+        };
+        let calibrated = SourceStatus {
             is_calibrated: true,
-            ..Status::default()
+            ..SourceStatus::default()
         };
-        let level = |silent_secs: f64, status: &Status| {
-            let status = status.message("map", Some(1.0), silent_secs);
-            diagnostics(&status, "mapper", silent_secs).status[0].level
+        let message = |silent_secs: f64, source: &SourceStatus| {
+            let status = Status {
+                source,
+                select: &SelectStatus::default(),
+                track: &track,
+                map: &MapStatus::default(),
+                published: &PublishedStatus::default(),
+            };
+            status.message("map", Some(1.0), silent_secs)
         };
-        assert_eq!([0.2, 1.5, 3.5].map(|secs| level(secs, &status)), [0, 1, 2]);
-        let paused = Status {
+        let level = |silent_secs: f64, source: &SourceStatus| {
+            diagnostics(&message(silent_secs, source), "mapper", silent_secs).status[0].level
+        };
+        assert_eq!(
+            [0.2, 1.5, 3.5].map(|secs| level(secs, &calibrated)),
+            [0, 1, 2]
+        );
+        let paused = SourceStatus {
             is_paused: true,
-            ..status.clone()
+            ..calibrated.clone()
         };
         assert_eq!(level(9.0, &paused), DiagnosticStatus::OK);
-        let silent = status.message("map", None, 5.0);
+        let silent = message(5.0, &calibrated);
         assert!(
             silent
                 .warnings

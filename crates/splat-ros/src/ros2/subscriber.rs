@@ -29,6 +29,8 @@ const SETTLE_SECS: f64 = 0.5;
 /// How often what an image waits for is looked at.
 const TICK: Duration = Duration::from_millis(2);
 
+/// Images of a topic and what comes beside them. Many fields: waiting for companions, jumps of time and silence each read
+/// what the others write (the intake, the stamps, the frame of the camera), so that parts would borrow one another.
 #[derive(Debug)]
 pub struct Ros2Source {
     link: Arc<Link>,

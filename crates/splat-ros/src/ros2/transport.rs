@@ -132,7 +132,7 @@ fn qos(delivery: Delivery) -> QosProfile {
 mod tests {
     use std::path::{Path, PathBuf};
 
-    use crate::publisher::TOPICS;
+    use crate::output::TOPICS;
     use splat_msgs::services::SERVICES;
     use splat_msgs::type_hash::hash_of;
     use splat_msgs::type_hash::service_hash;

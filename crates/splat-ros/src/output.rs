@@ -1,0 +1,132 @@
+//! Parameters -> all that goes out, opened: the publisher, which threads share, and the streams, which they own.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+
+use crate::error::PublishError;
+use crate::latched::{KEYFRAMES, LatchedStore, MANIFEST, SPLATS};
+use crate::map_stream::{CORRECTION, DELTA, MapStream};
+use crate::mcap_transport::McapTransport;
+use crate::navigation::{CLOUD, FRUSTA, KEYFRAME_CLOUD, PATH};
+use crate::odometry::FrameCells;
+use crate::params::PublishParams;
+use crate::pose_messages;
+use crate::pose_stream::{PoseStream, mount_of};
+use crate::publisher::Publisher;
+use crate::render_view::Frames;
+use crate::reports::Reports;
+use crate::service_server::{Controls, ServiceCall, ServiceServer};
+use crate::status::{DIAGNOSTICS, STATUS};
+use crate::status_stream::StatusStream;
+use crate::transport::{Topic, Transport};
+
+/// All topics of the node.
+pub static TOPICS: [&Topic; 14] = [
+    &pose_messages::POSE,
+    &pose_messages::ODOMETRY,
+    &pose_messages::TF,
+    &PATH,
+    &CLOUD,
+    &KEYFRAME_CLOUD,
+    &FRUSTA,
+    &KEYFRAMES,
+    &MANIFEST,
+    &SPLATS,
+    &DELTA,
+    &CORRECTION,
+    &STATUS,
+    &DIAGNOSTICS,
+];
+
+/// All that goes out while a run goes on.
+#[derive(Debug)]
+pub struct Output {
+    pub handles: OutputHandles,
+    pub streams: Streams,
+    /// What services ask of the map thread; `None` while that thread has it.
+    pub calls: Option<Receiver<ServiceCall>>,
+}
+
+/// What threads share.
+#[derive(Debug, Clone)]
+pub struct OutputHandles {
+    pub publisher: Arc<Publisher>,
+    pub reports: Arc<Reports>,
+    pub controls: Arc<Controls>,
+}
+
+/// What goes from message to message, each part owned by one thread; it outlives a map that is thrown away.
+#[derive(Debug)]
+pub struct Streams {
+    pub map: MapStream,
+    pub poses: PoseStream,
+    pub status: StatusStream,
+}
+
+impl Output {
+    /// Opens the transports that the parameters ask for, and `transport` beside them.
+    pub fn open(
+        params: &PublishParams,
+        transport: Option<Box<dyn Transport>>,
+    ) -> Result<Self, PublishError> {
+        let mount = mount_of(params)?;
+        let cells = Arc::<FrameCells>::default();
+        let latched = Arc::new(LatchedStore::new(&params.splat_frame, params.chunk_bytes));
+        let controls = Arc::new(Controls::default());
+        let frames = Frames {
+            map: params.map_frame.clone(),
+            splats: params.splat_frame.clone(),
+            cells: Arc::clone(&cells),
+        };
+        let (service_server, calls) = ServiceServer::new(
+            Arc::clone(&latched),
+            Arc::clone(&controls),
+            frames,
+            &params.map_directory,
+        );
+        let service_server = Arc::new(service_server);
+        let mut transports: Vec<Box<dyn Transport>> = Vec::new();
+        #[cfg(feature = "zenoh")]
+        if params.zenoh {
+            let (latched, service_server) = (Arc::clone(&latched), Arc::clone(&service_server));
+            let transport = crate::zenoh::transport::ZenohTransport::open(
+                params,
+                &TOPICS,
+                latched,
+                service_server,
+            )?;
+            transports.push(Box::new(transport));
+        }
+        #[cfg(not(feature = "zenoh"))]
+        if params.zenoh {
+            return Err(PublishError::Param {
+                name: "zenoh",
+                found: "true".to_owned(),
+                expected: "false, since this build has no zenoh; build with --features zenoh"
+                    .to_owned(),
+            });
+        }
+        if !params.record.is_empty() {
+            let transport = McapTransport::create(&PathBuf::from(&params.record))?;
+            transports.push(Box::new(transport));
+        }
+        transports.extend(transport);
+        // Time without an image counts from here.
+        let reports = Arc::<Reports>::default();
+        let streams = Streams {
+            map: MapStream::new(params, Arc::clone(&reports), Arc::clone(&cells)),
+            poses: PoseStream::new(mount, params, Arc::clone(&reports), cells),
+            status: StatusStream::new(params, Arc::clone(&reports)),
+        };
+        Ok(Self {
+            handles: OutputHandles {
+                publisher: Arc::new(Publisher::new(transports, latched, service_server)),
+                reports,
+                controls,
+            },
+            streams,
+            calls: Some(calls),
+        })
+    }
+}
