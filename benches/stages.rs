@@ -19,6 +19,7 @@ use splat_engine::cpu::engine::CpuEngine;
 use splat_engine::cpu::project_backward::{Forward, SplatGradients, project_backward};
 use splat_engine::cpu::raster_backward::{InstanceGradients, raster_backward};
 use splat_engine::cpu::{bin, loss, loss_buffers, project, raster};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 use splat_engine::traits::{Engine, SplatBuffers as _, Trainer as _, ViewStore as _};
 use splat_engine::view::TrainingView;
@@ -315,9 +316,10 @@ fn settings() -> StepSettings {
         lr_pose_rotation: 1e-7,
         lr_pose_translation: 1e-7,
         ssim_weight: 0.2,
-        depth_weight: 0.05,
-        opacity_reg: 0.01,
-        scale_reg: 0.01,
+        weights: LossWeights {
+            depth: 0.05,
+            ..LossWeights::all(0.01)
+        },
         sh_degree: 3,
         train_splats: true,
         pose: PoseMode::Direct,

@@ -14,6 +14,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::mcmc::Relocation;
 use splat_engine::settings::{McmcSettings, PoseMode, PoseNetworkSettings, StepSettings};
 use splat_engine::traits::Engine;
@@ -132,8 +133,11 @@ fn settings(n: u64) -> StepSettings {
         lr_focal: 1e-5,
         lr_exposure: 1e-4,
         ssim_weight: 0.2,
-        opacity_reg: 0.01,
-        scale_reg: 0.01,
+        weights: LossWeights {
+            opacity: 0.01,
+            scale: 0.01,
+            ..LossWeights::default()
+        },
         noise: 0.05,
         noise_seed: n as u32,
         sh_degree: 2,

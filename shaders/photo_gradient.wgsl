@@ -21,7 +21,7 @@ const MIN_WEIGHT_SUM: f32 = 1e-6;
 @group(0) @binding(6) var<storage, read_write> v_image: array<vec4<f32>>;
 // What lies behind the first splat, seen through the gradient, less the transmittance's part.
 @group(0) @binding(7) var<storage, read_write> behind: array<f32>;
-// Three per group: L1 and depth loss before their weights; gradient of log gain; gradient of offset.
+// Three per group: L1 and depth loss before their weights, further terms with theirs; gradient of log gain; gradient of offset.
 @group(0) @binding(8) var<storage, read_write> loss_sums: array<vec4<f32>>;
 
 var<workgroup> sums: array<vec4<f32>, 192>;

@@ -1,4 +1,4 @@
-// What one pass over an image has to know; the host fills it. Mirrored by splat/wgpu/types.rs.
+// What one pass over an image has to know; the host fills it. Mirrored by wgpu/types.rs of splat-engine.
 
 #import flat
 
@@ -34,9 +34,8 @@ struct Step {
     noise: f32,
     noise_seed: u32,
     ssim_weight: f32,
-    depth_weight: f32,
-    opacity_reg: f32,
-    scale_reg: f32,
+    // NAME_weight of each term, as loss_weights.rs of splat-engine declares them.
+#import loss_weights
     // Sum of the pixels' weights, and of their depth confidences.
     mask_sum: f32,
     confidence_sum: f32,

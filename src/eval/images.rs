@@ -37,20 +37,6 @@ pub struct DepthImage {
     pub far: f32,
 }
 
-/// Colours as a screen shows them: clamped, rounded to 8 bits.
-pub fn rgb_of(rendering: &Rendering) -> RgbImage {
-    let pixels = rendering
-        .rgb
-        .iter()
-        .map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8)
-        .collect();
-    RgbImage {
-        width_px: rendering.width_px,
-        height_px: rendering.height_px,
-        pixels,
-    }
-}
-
 /// Inverse depth in colours, from the 2nd to the 98th percentile; `None` when no pixel has a depth.
 pub fn depth_in_colours(rendering: &Rendering) -> Option<DepthImage> {
     let mut inverse: Vec<f32> = rendering

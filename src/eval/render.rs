@@ -7,7 +7,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use crate::eval::error::{EvalError, read_text, write_atomically};
-use crate::eval::images::{depth_png, png, rgb_of};
+use crate::eval::images::{depth_png, png};
 use splat_engine::traits::Engine;
 use splat_types::camera::Intrinsics;
 use splat_types::rendering::Rendering;
@@ -129,7 +129,7 @@ struct IntrinsicsFile {
 }
 
 fn write_image(rendering: &Rendering, path: &Path) -> Result<(), EvalError> {
-    let bytes = png(&rgb_of(rendering)).map_err(|e| EvalError::writing("a render", &e, path))?;
+    let bytes = png(&rendering.to_rgb()).map_err(|e| EvalError::writing("a render", &e, path))?;
     write_atomically("a render", &bytes, path)
 }
 

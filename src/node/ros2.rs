@@ -39,7 +39,7 @@ mod joined {
     use crate::params::live::Live;
     use crate::params::settings::Settings;
     use splat_msgs::services::SERVICES;
-    use splat_ros::output::TOPICS;
+    use splat_ros::output::topics;
     use splat_ros::publisher::Publisher;
     use splat_ros::ros2::lifecycle::Hands;
     use splat_ros::ros2::node::Link;
@@ -70,7 +70,7 @@ mod joined {
         pub fn transport(&self) -> anyhow::Result<Box<dyn Transport>> {
             Ok(Box::new(Ros2Transport::open(
                 Arc::clone(&self.link),
-                TOPICS,
+                topics(),
             )?))
         }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use base64::Engine as _;
 use maud::{Markup, html};
 
-use crate::eval::images::{depth_in_colours, jpeg, rgb_of, shrunk, viridis_css};
+use crate::eval::images::{depth_in_colours, jpeg, shrunk, viridis_css};
 use crate::eval::numbers::{decibels, number};
 use splat_types::image::RgbImage;
 use splat_types::rendering::Rendering;
@@ -57,7 +57,7 @@ fn comparison_row(comparison: &Comparison) -> image::ImageResult<Markup> {
     let unit = |value: f32| number(f64::from(value));
     let name = format!("keyframe {}", comparison.keyframe_id);
     let photo = embedded(&comparison.photo)?;
-    let rendering = embedded(&rgb_of(&comparison.rendering))?;
+    let rendering = embedded(&comparison.rendering.to_rgb())?;
     let depth_image = depth
         .as_ref()
         .map(|depth| embedded(&depth.image))

@@ -5,6 +5,7 @@ use std::mem::{offset_of, size_of};
 use naga::{Module, ScalarKind, TypeInner};
 
 use crate::shaders::{LANES, kernels, module};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::wgpu::kernels::PROJECT;
 use splat_engine::wgpu::types::{self, Camera, Moves, Projected, Step};
 use splat_geometry::mvs::gpu_types::{self, Dip, Sweep, Warp};
@@ -74,7 +75,7 @@ macro_rules! host_layout {
 
 #[test]
 fn the_step_has_the_layout_of_the_host() {
-    let step: Layout = host_layout!(
+    let mut step: Layout = host_layout!(
         Step,
         width_px,
         height_px,
@@ -105,9 +106,6 @@ fn the_step_has_the_layout_of_the_host() {
         noise,
         noise_seed,
         ssim_weight,
-        depth_weight,
-        opacity_reg,
-        scale_reg,
         mask_sum,
         confidence_sum,
         camera_scale,
@@ -118,6 +116,12 @@ fn the_step_has_the_layout_of_the_host() {
         epipolar_theta_y,
         epipolar_theta_z
     );
+    let weights = LossWeights::NAMES.iter().enumerate().map(|(ix, name)| {
+        let offset = offset_of!(Step, weights) + ix * size_of::<f32>();
+        (format!("{name}_weight"), offset, f32::NAME.to_owned())
+    });
+    step.0.extend(weights);
+    step.0.sort_by_key(|(_, offset, _)| *offset);
     assert_eq!(layout_in("Step", &PROJECT), step);
 }
 

@@ -3,7 +3,8 @@
 use splat_types::rendering::Rendering;
 
 /// One view's loss and its gradient. Arrays have the shape of those in [`Splats`](splat_types::splats::splats::Splats), with
-/// respect to the numbers before activation; 0 where a splat is not visible. `docs/GRADIENTS.md`, sections 5 to 8.
+/// respect to the numbers before activation; 0 where a splat is not visible. `docs/GRADIENTS.md`, sections 5 to 8. Many fields:
+/// an array for each of `Splats`, and each number that a reference states.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     /// d loss / d mean, per world unit.

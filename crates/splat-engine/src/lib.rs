@@ -108,6 +108,8 @@ pub mod gradients;
 
 pub mod mcmc;
 
+pub mod loss_weights;
+
 pub mod settings;
 
 pub mod pose_network;
@@ -115,6 +117,8 @@ pub mod pose_network;
 pub mod sh_rotation;
 
 pub mod view;
+
+pub mod random_start;
 
 pub(crate) mod epipolar;
 

@@ -1,5 +1,6 @@
 //! Numbers of one optimiser step and of one relocation; what steps report back.
 
+use crate::loss_weights::LossWeights;
 use crate::mcmc;
 
 /// What the depth loss compares. Equations: docs/GRADIENTS.md, losses.
@@ -53,7 +54,7 @@ pub struct McmcSettings {
 }
 
 /// Numbers of one step; the caller's schedule sets them. The default changes nothing. Rates are Adam's: about how far a number
-/// moves in one step. `docs/GRADIENTS.md`, sections 5 and 9.
+/// moves in one step. `docs/GRADIENTS.md`, sections 5 and 9. Many fields: a rate for each kind of number that is trained.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StepSettings {
     /// Of the means, world units; 1.6e-4 times the scene's extent in 3DGS, decaying to a hundredth.
@@ -80,16 +81,12 @@ pub struct StepSettings {
     pub lr_focal: f32,
     /// Adam rate of the view's gain and offset per channel; 0 holds them.
     pub lr_exposure: f32,
-    /// Weight of the depth loss; 0 turns it off.
-    pub depth_weight: f32,
+    /// Of the terms beside the photometric loss.
+    pub weights: LossWeights,
     /// What the depth loss compares.
     pub depth_mode: DepthMode,
     /// Weight of the symmetric epipolar distance, in px, over the view's correspondences; 0 turns it off. Moves the pose alone.
     pub epipolar_weight: f32,
-    /// Weight of the mean opacity over the visible splats (3DGS-MCMC regulariser).
-    pub opacity_reg: f32,
-    /// Weight of the mean scale over the visible splats, per world unit (3DGS-MCMC regulariser).
-    pub scale_reg: f32,
     /// Rate of SGLD noise on the means: `lr_mean` times 5e5 in the paper; 0 turns it off.
     pub noise: f32,
     /// Of the noise, with the number of the step and of the splat.

@@ -43,12 +43,14 @@ const TILE_PIXELS: u32 = 256;
 macro_rules! kernels {
     (
         folder $folder:literal;
-        libraries [$($library:literal),* $(,)?];
+        libraries [$($library:literal),* $(,)?] $(and [$($made:literal = $text:expr),* $(,)?])?;
         $($constant:ident $name:literal $size:tt [$($binding:ident $access:ident),* $(,)?];)*
     ) => {
-        /// Files of `shaders/lib/`, by the name that `#import` uses.
-        pub const LIBRARIES: &[(&str, &str)] =
-            &[$(($library, include_str!(concat!($folder, "lib/", $library, ".wgsl")))),*];
+        /// Files of `shaders/lib/`, and texts that the host makes, by the name that `#import` uses.
+        pub const LIBRARIES: &[(&str, &str)] = &[
+            $(($library, include_str!(concat!($folder, "lib/", $library, ".wgsl"))),)*
+            $($(($made, $text),)*)?
+        ];
         $(pub const $constant: $crate::kernel::Kernel = $crate::kernel::Kernel {
             name: $name,
             source: include_str!(concat!($folder, $name, ".wgsl")),

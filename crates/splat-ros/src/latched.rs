@@ -15,6 +15,7 @@ pub static KEYFRAMES: Topic =
 pub static SPLATS: Topic = Topic::of::<SplatChunk>("splats", Delivery::Reliable { depth: 1000 });
 pub static MANIFEST: Topic =
     Topic::of::<SplatManifest>("splats/manifest", Delivery::Latched { depth: 1 });
+pub static TOPICS: [&Topic; 3] = [&KEYFRAMES, &MANIFEST, &SPLATS];
 
 /// The published map, with the digest of its splats: that takes a pass over all of them.
 #[derive(Debug, Clone)]

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use crate::error::PublishError;
 use crate::latched::{KEYFRAMES, MANIFEST, SPLATS};
-use crate::navigation::{self, CLOUD, FRUSTA, PATH};
+use crate::navigation;
 use crate::odometry::FrameCells;
 use crate::params::PublishParams;
 use crate::publisher::Publisher;
@@ -20,7 +20,6 @@ use splat_types::snapshot::Snapshot;
 use splat_types::splats::layout;
 use splat_types::splats::splats::{SH_C0, Splats};
 use splat_types::time::Stopwatch;
-use splat_types::transform::Similarity;
 
 /// Change below it is not seen: in standard deviations of the splat, or steps of a 0 to 1 colour times two, each
 /// weighed by the splat's opacity.
@@ -29,6 +28,7 @@ const MIN_CHANGE: f32 = 0.02;
 pub static CORRECTION: Topic =
     Topic::of::<MapCorrectionMsg>("correction", Delivery::Latched { depth: 10 });
 pub static DELTA: Topic = Topic::of::<SplatDelta>("splats/delta", Delivery::Reliable { depth: 64 });
+pub static TOPICS: [&Topic; 2] = [&DELTA, &CORRECTION];
 
 /// What changes with every snapshot; owned by the thread that publishes them.
 #[derive(Debug)]
@@ -125,27 +125,12 @@ impl MapStream {
             publisher.send(&Sample::of(&CORRECTION, snapshot.stamp, &message)?)?;
         }
         update.send(publisher, &latched.messages(&kept))?;
-        self.send_navigation(publisher, snapshot, &map_from_world)?;
+        let send = |sample: &Sample| publisher.send(sample);
+        navigation::of_snapshot(snapshot, &map_from_world, &self.params, &send)?;
         if matches!(update, Update::Whole) {
             self.since_whole = Some(Stopwatch::start());
         }
         Ok(())
-    }
-
-    /// What planners and displays take: trajectory, points and cameras in the map frame.
-    fn send_navigation(
-        &self,
-        publisher: &Publisher,
-        snapshot: &Snapshot,
-        map_from_world: &Similarity,
-    ) -> Result<(), PublishError> {
-        let stamp = snapshot.stamp;
-        let path = navigation::path(snapshot, map_from_world, &self.params);
-        publisher.send(&Sample::of(&PATH, stamp, &path)?)?;
-        let cloud = navigation::cloud(snapshot, map_from_world, &self.params);
-        publisher.send(&Sample::of(&CLOUD, stamp, &cloud)?)?;
-        let frusta = navigation::frusta(snapshot, map_from_world, &self.params);
-        publisher.send(&Sample::of(&FRUSTA, stamp, &frusta)?)
     }
 }
 

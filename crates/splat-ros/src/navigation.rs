@@ -2,8 +2,9 @@
 
 use glam::DVec3;
 
+use crate::error::PublishError;
 use crate::params::PublishParams;
-use crate::transport::{Delivery, Topic};
+use crate::transport::{Delivery, Sample, Topic};
 use splat_msgs::ros::standard::{ColorRgba, Marker, MarkerArray, Path, PointCloud2, PointField};
 use splat_msgs::ros::{Header, PoseStamped, Vector3};
 use splat_types::camera::Intrinsics;
@@ -18,6 +19,9 @@ pub static PATH: Topic = Topic::of::<Path>("path", Delivery::Latched { depth: 1 
 pub static CLOUD: Topic = Topic::of::<PointCloud2>("cloud", Delivery::Latched { depth: 1 });
 pub static KEYFRAME_CLOUD: Topic = Topic::of::<PointCloud2>("keyframe_cloud", Delivery::Newest);
 pub static FRUSTA: Topic = Topic::of::<MarkerArray>("frusta", Delivery::Latched { depth: 1 });
+
+/// All of them.
+pub static TOPICS: [&Topic; 4] = [&PATH, &CLOUD, &KEYFRAME_CLOUD, &FRUSTA];
 
 /// Poses of a path in one message; beyond it every n-th keyframe.
 const MAX_POSES: usize = 5000;
@@ -41,6 +45,31 @@ pub struct KeyframeDepth {
     pub intrinsics: Intrinsics,
     /// Unit of the splats.
     pub depth: std::sync::Arc<DepthMap>,
+}
+
+/// Hands out what goes out with every snapshot, one message after the other; `KEYFRAME_CLOUD` goes with keyframes.
+pub(crate) fn of_snapshot(
+    snapshot: &Snapshot,
+    map_from_world: &Similarity,
+    params: &PublishParams,
+    send: &dyn Fn(&Sample) -> Result<(), PublishError>,
+) -> Result<(), PublishError> {
+    let stamp = snapshot.stamp;
+    send(&Sample::of(
+        &PATH,
+        stamp,
+        &path(snapshot, map_from_world, params),
+    )?)?;
+    send(&Sample::of(
+        &CLOUD,
+        stamp,
+        &cloud(snapshot, map_from_world, params),
+    )?)?;
+    send(&Sample::of(
+        &FRUSTA,
+        stamp,
+        &frusta(snapshot, map_from_world, params),
+    )?)
 }
 
 /// Refined cameras in the map frame, oldest first.

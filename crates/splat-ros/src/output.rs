@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use crate::error::PublishError;
-use crate::latched::{KEYFRAMES, LatchedStore, MANIFEST, SPLATS};
-use crate::map_stream::{CORRECTION, DELTA, MapStream};
+use crate::latched::{self, LatchedStore};
+use crate::map_stream::{self, MapStream};
 use crate::mcap_transport::McapTransport;
-use crate::navigation::{CLOUD, FRUSTA, KEYFRAME_CLOUD, PATH};
+use crate::navigation;
 use crate::odometry::FrameCells;
 use crate::params::PublishParams;
 use crate::pose_messages;
@@ -17,27 +17,21 @@ use crate::publisher::Publisher;
 use crate::render_view::Frames;
 use crate::reports::Reports;
 use crate::service_server::{Controls, ServiceCall, ServiceServer};
-use crate::status::{DIAGNOSTICS, STATUS};
+use crate::status;
 use crate::status_stream::StatusStream;
 use crate::transport::{Topic, Transport};
 
-/// All topics of the node.
-pub static TOPICS: [&Topic; 14] = [
-    &pose_messages::POSE,
-    &pose_messages::ODOMETRY,
-    &pose_messages::TF,
-    &PATH,
-    &CLOUD,
-    &KEYFRAME_CLOUD,
-    &FRUSTA,
-    &KEYFRAMES,
-    &MANIFEST,
-    &SPLATS,
-    &DELTA,
-    &CORRECTION,
-    &STATUS,
-    &DIAGNOSTICS,
-];
+/// All topics of the node; each stream lists its own.
+pub fn topics() -> Vec<&'static Topic> {
+    [
+        &pose_messages::TOPICS[..],
+        &navigation::TOPICS,
+        &latched::TOPICS,
+        &map_stream::TOPICS,
+        &status::TOPICS,
+    ]
+    .concat()
+}
 
 /// All that goes out while a run goes on.
 #[derive(Debug)]
@@ -92,7 +86,7 @@ impl Output {
             let (latched, service_server) = (Arc::clone(&latched), Arc::clone(&service_server));
             let transport = crate::zenoh::transport::ZenohTransport::open(
                 params,
-                &TOPICS,
+                &topics(),
                 latched,
                 service_server,
             )?;

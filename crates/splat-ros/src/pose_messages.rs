@@ -16,6 +16,7 @@ use splat_types::transform::Rigid;
 pub static POSE: Topic = Topic::of::<PoseWithCovarianceStamped>("pose", Delivery::Newest);
 pub static ODOMETRY: Topic = Topic::of::<Odometry>("odometry", Delivery::Newest);
 pub static TF: Topic = Topic::of::<TfMessage>("/tf", Delivery::Reliable { depth: 100 });
+pub static TOPICS: [&Topic; 3] = [&POSE, &ODOMETRY, &TF];
 
 /// Variance of what is not known: so large that no filter goes by it.
 const UNKNOWN: f64 = 1e6;

@@ -14,6 +14,7 @@ use splat_types::tracking::TrackState;
 pub static STATUS: Topic = Topic::of::<MapperStatus>("status", Delivery::Latched { depth: 1 });
 pub static DIAGNOSTICS: Topic =
     Topic::of::<DiagnosticArray>("/diagnostics", Delivery::Reliable { depth: 10 });
+pub static TOPICS: [&Topic; 2] = [&STATUS, &DIAGNOSTICS];
 
 /// Times that a percentile is taken over.
 const MAX_TIMES: usize = 1000;

@@ -31,10 +31,16 @@ pub struct Tiles {
     pub places: Vec<[u32; 2]>,
     /// Farthest splats left out because of `MAX_PAIRS`.
     pub n_left_out: usize,
-    order: Vec<u64>,
-    order_scratch: Vec<u64>,
+    order: DepthOrder,
     hits: Vec<Hits>,
     fill: Vec<u32>,
+}
+
+/// Visible splats, near to far: depth in the upper half of a key, the splat's number in the lower.
+#[derive(Debug, Default)]
+struct DepthOrder {
+    keys: Vec<u64>,
+    scratch: Vec<u64>,
 }
 
 /// Tiles that a run of splats touches.
@@ -61,49 +67,49 @@ pub fn bin(visible: &[ProjectedSplat], width_px: u32, height_px: u32, out: &mut 
 /// `order` holds depth bits above the visible index: sorted by depth, then by index.
 fn sort_by_depth(visible: &[ProjectedSplat], out: &mut Tiles) {
     const DIGIT_BITS: u32 = 11;
-    out.order.clear();
+    out.order.keys.clear();
     // Depths are positive, so that their bits order as they do.
-    out.order.extend(
+    out.order.keys.extend(
         visible
             .iter()
             .enumerate()
             .map(|(ix, s)| u64::from(s.depth.to_bits()) << 32 | ix as u64),
     );
-    out.order_scratch.clear();
-    out.order_scratch.resize(visible.len(), 0);
+    out.order.scratch.clear();
+    out.order.scratch.resize(visible.len(), 0);
     for pass in 0..3 {
         let digit = |key: u64| (key >> (32 + pass * DIGIT_BITS)) as usize & ((1 << DIGIT_BITS) - 1);
         let mut ends = [0u32; 1 << DIGIT_BITS];
-        for &key in &out.order {
+        for &key in &out.order.keys {
             ends[digit(key)] += 1;
         }
         let mut sum = 0;
         for end in &mut ends {
             sum += std::mem::replace(end, sum);
         }
-        for &key in &out.order {
+        for &key in &out.order.keys {
             let slot = &mut ends[digit(key)];
-            out.order_scratch[*slot as usize] = key;
+            out.order.scratch[*slot as usize] = key;
             *slot += 1;
         }
-        std::mem::swap(&mut out.order, &mut out.order_scratch);
+        std::mem::swap(&mut out.order.keys, &mut out.order.scratch);
     }
 }
 
 fn leave_out_farthest(visible: &[ProjectedSplat], out: &mut Tiles) {
     let mut n_pairs = 0;
-    let n_fit = out.order.iter().take_while(|&&key| {
+    let n_fit = out.order.keys.iter().take_while(|&&key| {
         let [x0, y0, x1, y1] = visible[visible_ix(key)].tiles.map(u64::from);
         n_pairs += (x1 - x0) * (y1 - y0);
         n_pairs <= MAX_PAIRS
     });
     let n_fit = n_fit.count();
-    out.n_left_out = out.order.len() - n_fit;
-    out.order.truncate(n_fit);
+    out.n_left_out = out.order.keys.len() - n_fit;
+    out.order.keys.truncate(n_fit);
 }
 
 fn find_hits(visible: &[ProjectedSplat], out: &mut Tiles) {
-    let (order, n_x) = (&out.order, out.n_x);
+    let (order, n_x) = (&out.order.keys, out.n_x);
     out.hits
         .resize_with(order.len().div_ceil(CHUNK), Hits::default);
     out.hits
@@ -155,7 +161,7 @@ fn count(out: &mut Tiles) {
 }
 
 fn place(out: &mut Tiles) {
-    let n_visible = out.order.len() + out.n_left_out;
+    let n_visible = out.order.keys.len() + out.n_left_out;
     let n_instances = out.starts.last().map_or(0, |&n| n as usize);
     out.instances.resize(n_instances, 0);
     out.places.clear();
@@ -165,7 +171,7 @@ fn place(out: &mut Tiles) {
     // Runs from a tile's first instance to its end while the tile fills.
     out.fill.clear();
     out.fill.extend_from_slice(&out.starts);
-    for (hits, keys) in out.hits.iter().zip(out.order.chunks(CHUNK)) {
+    for (hits, keys) in out.hits.iter().zip(out.order.keys.chunks(CHUNK)) {
         let mut begin = 0;
         for (&key, &end) in keys.iter().zip(&hits.ends) {
             let visible_ix = visible_ix(key);

@@ -26,7 +26,7 @@ splat_gpu::kernels! {
         "step",
         "tile_backward",
         "view",
-    ];
+    ] and ["loss_weights" = crate::loss_weights::WGSL_FIELDS];
     VIEW_CAMERA "view_camera" 64 [step Uniform, views ReadWrite, network Read, camera ReadWrite];
     CULL "cull" 256 [step Uniform, camera Read, geometry Read, visible_bits ReadWrite, block_counts ReadWrite];
     VISIBLE_ARGS "visible_args" 1 [

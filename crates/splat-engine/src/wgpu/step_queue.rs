@@ -143,7 +143,7 @@ impl WgpuEngine {
         let [depth_width, depth_height] = view.depth_size();
         let image = &view.training.image;
         let has_depth =
-            depth_width > 0 && s.depth_weight > 0.0 && s.depth_mode == DepthMode::InverseDepth;
+            depth_width > 0 && s.weights.depth > 0.0 && s.depth_mode == DepthMode::InverseDepth;
         let flag = |is_set: bool, flag: u32| if is_set { flag } else { 0 };
         let flags = flag(s.train_splats, FLAG_TRAIN_SPLATS)
             | flag(s.moves_alone(), FLAG_POSE_DIRECT)
@@ -176,9 +176,7 @@ impl WgpuEngine {
             noise: s.noise,
             noise_seed: s.noise_seed,
             ssim_weight: s.ssim_weight,
-            depth_weight: s.depth_weight,
-            opacity_reg: s.opacity_reg,
-            scale_reg: s.scale_reg,
+            weights: s.weights,
             mask_sum: view.mask_sum,
             confidence_sum: view.confidence_sum,
             camera_scale: self.views.pose_network.map_or(0.0, |r| r.camera_scale),

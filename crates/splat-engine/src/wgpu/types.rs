@@ -3,7 +3,9 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// `Step` of `shaders/lib/step.wgsl`.
+use crate::loss_weights::LossWeights;
+
+/// `Step` of `shaders/lib/step.wgsl`. Many fields: names of that struct, one by one, as the layout test compares them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Step {
@@ -36,9 +38,7 @@ pub struct Step {
     pub noise: f32,
     pub noise_seed: u32,
     pub ssim_weight: f32,
-    pub depth_weight: f32,
-    pub opacity_reg: f32,
-    pub scale_reg: f32,
+    pub weights: LossWeights,
     pub mask_sum: f32,
     pub confidence_sum: f32,
     pub camera_scale: f32,
@@ -58,7 +58,7 @@ pub const FLAG_POSE_SHARED: u32 = 8;
 pub const FLAG_DEPTH: u32 = 16;
 pub const FLAG_POSE_NETWORK: u32 = 32;
 
-/// `Camera` of `shaders/lib/camera.wgsl`.
+/// `Camera` of `shaders/lib/camera.wgsl`. Many fields: names of that struct.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Camera {
@@ -81,7 +81,7 @@ pub struct Camera {
     pub padding_2: u32,
 }
 
-/// `Projected` of `shaders/lib/projected.wgsl`.
+/// `Projected` of `shaders/lib/projected.wgsl`. Many fields: names of that struct.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Projected {

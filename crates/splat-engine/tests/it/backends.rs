@@ -8,6 +8,7 @@ use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::{self, Params, Target, Weights};
 use splat_engine::cpu::engine::{self, CpuEngine};
 use splat_engine::gradients::Gradients;
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{DepthMode, StepSettings};
 use splat_engine::traits::Engine;
 use splat_engine::view::TrainingView;
@@ -79,62 +80,45 @@ pub const ORDINARY: Recipe = Recipe {
 };
 
 /// Each term so heavy that its gradient cannot hide behind the others.
-fn emphases() -> [(&'static str, StepSettings); 8] {
+fn emphases() -> Vec<(String, StepSettings)> {
     let plain = StepSettings {
         ssim_weight: 0.0,
-        depth_weight: 0.0,
-        opacity_reg: 0.0,
-        scale_reg: 0.0,
+        weights: LossWeights::default(),
         ..random::settings()
     };
-    [
-        ("l1", plain.clone()),
+    let ssim = StepSettings {
+        ssim_weight: 1.0,
+        ..plain.clone()
+    };
+    let depth = |depth_mode| StepSettings {
+        weights: LossWeights {
+            depth: 30.0,
+            ..LossWeights::default()
+        },
+        depth_mode,
+        ..plain.clone()
+    };
+    let mut emphases = vec![
+        ("l1".to_owned(), plain.clone()),
+        ("ssim".to_owned(), ssim),
         (
-            "ssim",
-            StepSettings {
-                ssim_weight: 1.0,
-                ..plain.clone()
-            },
+            "depth as in the paper's code".to_owned(),
+            depth(DepthMode::PaperCode),
         ),
         (
-            "depth",
-            StepSettings {
-                depth_weight: 30.0,
-                ..plain.clone()
-            },
+            "depth as in the paper's text".to_owned(),
+            depth(DepthMode::PaperAlpha),
         ),
-        (
-            "depth as in the paper's code",
-            StepSettings {
-                depth_weight: 30.0,
-                depth_mode: DepthMode::PaperCode,
-                ..plain.clone()
-            },
-        ),
-        (
-            "depth as in the paper's text",
-            StepSettings {
-                depth_weight: 30.0,
-                depth_mode: DepthMode::PaperAlpha,
-                ..plain.clone()
-            },
-        ),
-        (
-            "opacity",
-            StepSettings {
-                opacity_reg: 30.0,
-                ..plain.clone()
-            },
-        ),
-        (
-            "scale",
-            StepSettings {
-                scale_reg: 30.0,
-                ..plain
-            },
-        ),
-        ("all", random::settings()),
-    ]
+        ("all".to_owned(), random::settings()),
+    ];
+    for (ix, name) in LossWeights::NAMES.iter().enumerate() {
+        let alone = StepSettings {
+            weights: LossWeights::only(ix, 30.0),
+            ..plain.clone()
+        };
+        emphases.push(((*name).to_owned(), alone));
+    }
+    emphases
 }
 
 fn reference_gradients(
@@ -232,7 +216,7 @@ fn compare(
     if settings.ssim_weight > 0.0 {
         losses.push((found.ssim, reference.loss.ssim));
     }
-    if settings.depth_weight > 0.0 {
+    if settings.weights.depth > 0.0 {
         losses.push((found.depth, reference.loss.depth));
     }
     errors[8] = losses

@@ -7,6 +7,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 use splat_engine::traits::{Renderer as _, SplatBuffers as _, Trainer as _, ViewStore as _};
 use splat_engine::view::TrainingView;
@@ -377,9 +378,10 @@ fn settings() -> StepSettings {
         lr_pose_rotation: 1e-5,
         lr_pose_translation: 1e-5,
         ssim_weight: 0.2,
-        depth_weight: 0.05,
-        opacity_reg: 0.001,
-        scale_reg: 0.001,
+        weights: LossWeights {
+            depth: 0.05,
+            ..LossWeights::all(0.001)
+        },
         sh_degree: 3,
         train_splats: true,
         pose: PoseMode::Direct,

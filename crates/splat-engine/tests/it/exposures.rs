@@ -8,6 +8,7 @@ use crate::reference::adam::ExposureAdam;
 use crate::reference::hostile::KINDS;
 use crate::reference::random::{self, Scene};
 use splat_engine::cpu::engine::{self, CpuEngine};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 use splat_engine::traits::{Renderer as _, SplatBuffers as _, Trainer as _, ViewStore as _};
 use splat_engine::view::TrainingView;
@@ -102,7 +103,10 @@ fn the_pull_keeps_the_common_exposure_at_zero() {
     let settings = StepSettings {
         lr_exposure: 0.01,
         pose: PoseMode::Held,
-        depth_weight: 0.0,
+        weights: LossWeights {
+            depth: 0.0,
+            ..random::settings().weights
+        },
         ..random::settings()
     };
     (0..800).for_each(|n| engine.step(n % 2, &settings).unwrap());
@@ -158,8 +162,11 @@ fn a_mask_of_ones_changes_no_bit_and_one_of_zeros_gives_no_loss() {
             .set_mask(0, byte.map(|byte| vec![byte; n_pixels].into()))
             .unwrap();
         let settings = StepSettings {
-            opacity_reg: 0.0,
-            scale_reg: 0.0,
+            weights: LossWeights {
+                opacity: 0.0,
+                scale: 0.0,
+                ..random::settings().weights
+            },
             ..random::settings()
         };
         (0..3).for_each(|_| engine.step(0, &settings).unwrap());
@@ -189,7 +196,10 @@ fn hostile_scenes_stay_finite_with_every_mode_on() {
             for step in 0..6 {
                 let settings = StepSettings {
                     depth_mode: modes[step % 3],
-                    depth_weight: 1.0,
+                    weights: LossWeights {
+                        depth: 1.0,
+                        ..random::settings().weights
+                    },
                     lr_exposure: 0.5,
                     noise: 1000.0,
                     noise_seed: seed as u32,

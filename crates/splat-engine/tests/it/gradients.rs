@@ -3,20 +3,25 @@
 use crate::reference::differences::{ARRAYS, Problem, flat};
 use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::{Gradients, Target, Weights, loss, project, raster};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::DepthMode;
 
 /// No term at all.
 const NONE: Weights = Weights {
     l1: 0.0,
     ssim: 0.0,
-    depth: 0.0,
     depth_mode: DepthMode::InverseDepth,
-    opacity: 0.0,
-    scale: 0.0,
+    terms: LossWeights::all(0.0),
 };
 const L1: Weights = Weights { l1: 1.0, ..NONE };
 const SSIM: Weights = Weights { ssim: 1.0, ..NONE };
-const DEPTH: Weights = Weights { depth: 1.0, ..NONE };
+const DEPTH: Weights = Weights {
+    terms: LossWeights {
+        depth: 1.0,
+        ..NONE.terms
+    },
+    ..NONE
+};
 const PAPER_CODE: Weights = Weights {
     depth_mode: DepthMode::PaperCode,
     ..DEPTH
@@ -25,17 +30,13 @@ const PAPER_ALPHA: Weights = Weights {
     depth_mode: DepthMode::PaperAlpha,
     ..DEPTH
 };
-const OPACITY: Weights = Weights {
-    opacity: 1.0,
-    ..NONE
-};
-const SCALE: Weights = Weights { scale: 1.0, ..NONE };
 const ALL: Weights = Weights {
     l1: 0.8,
     ssim: 0.2,
-    depth: 0.3,
-    opacity: 0.1,
-    scale: 0.1,
+    terms: LossWeights {
+        depth: 0.3,
+        ..LossWeights::all(0.1)
+    },
     ..NONE
 };
 
@@ -59,16 +60,16 @@ fn eventful_scene(seed: u64, sh_degree: u8) -> Scene {
 }
 
 fn check_terms(sh_degree: u8, seed: u64) {
-    for (name, weights) in [
-        ("l1", L1),
-        ("ssim", SSIM),
-        ("depth", DEPTH),
+    let photometric = [("l1", L1), ("ssim", SSIM), ("all", ALL)];
+    let stretched = [
         ("depth as in the paper's code", PAPER_CODE),
         ("depth as in the paper's text", PAPER_ALPHA),
-        ("opacity", OPACITY),
-        ("scale", SCALE),
-        ("all", ALL),
-    ] {
+    ];
+    let terms = LossWeights::NAMES.iter().enumerate().map(|(ix, name)| {
+        let terms = LossWeights::only(ix, 1.0);
+        (*name, Weights { terms, ..NONE })
+    });
+    for (name, weights) in photometric.into_iter().chain(stretched).chain(terms) {
         let problem = Problem::new(eventful_scene(seed, sh_degree), weights, sh_degree);
         let claimed = problem.gradients(&problem.point);
         if let Err(reason) = problem.check(&claimed) {
@@ -220,8 +221,11 @@ fn a_image_of_which_no_pixel_counts_has_no_loss_and_no_gradient() {
     let n_pixels = scene.view.image.pixels.len() / 3;
     scene.view.mask = Some(vec![0; n_pixels].into());
     let weights = Weights {
-        opacity: 0.0,
-        scale: 0.0,
+        terms: LossWeights {
+            opacity: 0.0,
+            scale: 0.0,
+            ..ALL.terms
+        },
         ..ALL
     };
     let problem = Problem::new(scene, weights, 1);

@@ -7,6 +7,7 @@ use rand::{Rng, RngExt};
 
 use crate::backends::{BACKENDS, ORDINARY};
 use crate::reference::random::{self, rng};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::pose_network::{Embedding, Moments, PoseNetwork, first_embedding};
 use splat_engine::settings::{PoseMode, PoseNetworkSettings, StepSettings};
 use splat_engine::traits::Engine;
@@ -347,9 +348,7 @@ fn left_over(
 fn joint() -> StepSettings {
     StepSettings {
         lr_mean: 5e-4,
-        depth_weight: 0.0,
-        opacity_reg: 0.0,
-        scale_reg: 0.0,
+        weights: LossWeights::default(),
         sh_degree: 0,
         ..random::settings()
     }

@@ -52,7 +52,8 @@ pub fn loss(raster: &Raster, target: &Target, weights: &Weights) -> Loss {
     }
     let (mut v_alpha, mut v_depth_sum) = (vec![0.0; n], vec![0.0; n]);
     let (depth, depth_decisions) = depth(raster, target, weights, [&mut v_alpha, &mut v_depth_sum]);
-    let total = weights.l1 * l1 + weights.ssim * (1.0 - ssim) + weights.depth * depth;
+    let total =
+        weights.l1 * l1 + weights.ssim * (1.0 - ssim) + f64::from(weights.terms.depth) * depth;
     Loss {
         total,
         l1,
@@ -154,17 +155,18 @@ pub fn regularise(
     v_splats: &mut Params,
 ) -> f64 {
     let n = visible.len().max(1) as f64;
+    let [by_opacity, by_scale] = [weights.terms.opacity, weights.terms.scale].map(f64::from);
     let mut total = 0.0;
     for &ix in visible {
         let opacity = sigmoid(params.opacity_logits[ix]);
-        total += weights.opacity * opacity / n;
-        v_splats.opacity_logits[ix] += weights.opacity / n * opacity * (1.0 - opacity);
+        total += by_opacity * opacity / n;
+        v_splats.opacity_logits[ix] += by_opacity / n * opacity * (1.0 - opacity);
         for (log_scale, v) in params.log_scales[ix]
             .iter()
             .zip(&mut v_splats.log_scales[ix])
         {
-            total += weights.scale * log_scale.exp() / (3.0 * n);
-            *v += weights.scale * log_scale.exp() / (3.0 * n);
+            total += by_scale * log_scale.exp() / (3.0 * n);
+            *v += by_scale * log_scale.exp() / (3.0 * n);
         }
     }
     total

@@ -22,17 +22,18 @@ pub struct Decisions {
     pub margin: f64,
 }
 
-/// Adds `weights.depth` times the gradient. Returns the loss before its weight.
+/// Adds `weights.terms.depth` times the gradient. Returns the loss before its weight.
 pub fn depth(
     raster: &Raster,
     target: &Target,
     weights: &Weights,
     v: [&mut [f64]; 2],
 ) -> (f64, Decisions) {
+    let weight = f64::from(weights.terms.depth);
     match weights.depth_mode {
-        DepthMode::InverseDepth => inverse(raster, target, weights.depth, v),
-        DepthMode::PaperCode => stretched(raster, target, weights.depth, false, v),
-        DepthMode::PaperAlpha => stretched(raster, target, weights.depth, true, v),
+        DepthMode::InverseDepth => inverse(raster, target, weight, v),
+        DepthMode::PaperCode => stretched(raster, target, weight, false, v),
+        DepthMode::PaperAlpha => stretched(raster, target, weight, true, v),
     }
 }
 

@@ -21,6 +21,7 @@ use loss::Loss;
 use nalgebra::{Matrix3, Vector3};
 use raster::Raster;
 
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{DepthMode, StepSettings};
 use splat_engine::view::TrainingView;
 use splat_types::camera::Intrinsics;
@@ -66,10 +67,9 @@ pub struct Target {
 pub struct Weights {
     pub l1: f64,
     pub ssim: f64,
-    pub depth: f64,
     pub depth_mode: DepthMode,
-    pub opacity: f64,
-    pub scale: f64,
+    /// Of the terms beside the photometric loss.
+    pub terms: LossWeights,
 }
 
 #[derive(Debug, Clone)]
@@ -191,10 +191,8 @@ impl Weights {
         Self {
             l1: 1.0 - ssim,
             ssim,
-            depth: f64::from(settings.depth_weight),
             depth_mode: settings.depth_mode,
-            opacity: f64::from(settings.opacity_reg),
-            scale: f64::from(settings.scale_reg),
+            terms: settings.weights,
         }
     }
 }

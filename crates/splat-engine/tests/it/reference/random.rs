@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 use splat_engine::view::TrainingView;
 use splat_types::camera::Intrinsics;
@@ -59,9 +60,10 @@ pub fn settings() -> StepSettings {
         lr_pose_rotation: 1e-3,
         lr_pose_translation: 2e-3,
         ssim_weight: 0.2,
-        depth_weight: 0.1,
-        opacity_reg: 0.01,
-        scale_reg: 0.01,
+        weights: LossWeights {
+            depth: 0.1,
+            ..LossWeights::all(0.01)
+        },
         sh_degree: 3,
         train_splats: true,
         pose: PoseMode::Direct,

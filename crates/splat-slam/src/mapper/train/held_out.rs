@@ -4,6 +4,7 @@ use crate::mapper::params::MapperParams;
 use crate::mapper::parts::Parts;
 use crate::mapper::train::schedule::{self, Phase};
 use splat_engine::error::EngineError;
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 
 /// Steps that refine the pose of one held-out view, and the share of the rate at the last (3R-GS: 100 steps, to 1 %).
@@ -40,10 +41,8 @@ pub(crate) fn pose_only(
         lr_pose_rotation: rate,
         lr_pose_translation: rate * scene_depth,
         lr_focal: 0.0,
-        depth_weight: 0.0,
+        weights: LossWeights::default(),
         epipolar_weight: 0.0,
-        opacity_reg: 0.0,
-        scale_reg: 0.0,
         noise: 0.0,
         ..schedule::settings(params, scene_depth, pose_error, Phase::Final(1.0))
     }

@@ -5,6 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization};
+use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
 /// Share of the steps between arrivals that train on the newest views.
@@ -102,6 +103,11 @@ pub fn settings(
     let sh_is_on = params.train.sh_interval > 0 || (phase != Phase::Streaming && done >= SH_START);
     let lr_mean = decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
+    let mut weights = LossWeights::all(0.0);
+    weights.depth = decayed(params.train.depth_weight, FINAL_DEPTH_WEIGHT);
+    weights.opacity = if_mcmc(params.mcmc.opacity_reg);
+    // A scale is a length: its share of the scene is what has a size.
+    weights.scale = if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE));
     StepSettings {
         lr_mean,
         lr_scale: params.train.lr_scale,
@@ -123,16 +129,13 @@ pub fn settings(
         lr_focal: pose_share * decayed(params.train.lr_focal, FINAL_POSE_RATE),
         lr_exposure: params.train.lr_exposure,
         ssim_weight: params.train.ssim_weight,
-        depth_weight: decayed(params.train.depth_weight, FINAL_DEPTH_WEIGHT),
+        weights,
         depth_mode: match params.train.depth_mode {
             DepthLoss::InvDepth => DepthMode::InverseDepth,
             DepthLoss::PaperCode => DepthMode::PaperCode,
             DepthLoss::PaperAlpha => DepthMode::PaperAlpha,
         },
         epipolar_weight: params.train.epipolar_weight,
-        opacity_reg: if_mcmc(params.mcmc.opacity_reg),
-        // A scale is a length: its share of the scene is what has a size.
-        scale_reg: if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE)),
         noise: if_mcmc(lr_mean * params.mcmc.noise),
         sh_degree: if sh_is_on { params.train.sh_degree } else { 0 },
         sh_interval: params.train.sh_interval,

@@ -1,0 +1,69 @@
+//! Weights of the terms of the loss: each is declared here once, for the settings of a step, for both backends, for the
+//! shaders and for the tests that prove its gradient.
+
+use bytemuck::{Pod, Zeroable};
+
+/// A field of `LossWeights`, and `NAME_weight: f32` of `Step` in `shaders/lib/step.wgsl`, for each term.
+macro_rules! loss_weights {
+    ($($(#[$doc:meta])* $name:ident,)*) => {
+        /// Weights of the terms that are added to the photometric loss; 0 turns a term off.
+        #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+        #[repr(C)]
+        pub struct LossWeights {
+            $($(#[$doc])* pub $name: f32,)*
+        }
+
+        impl LossWeights {
+            /// Names of the terms, in order.
+            pub const NAMES: &[&str] = &[$(stringify!($name)),*];
+
+            /// Every term at the same weight.
+            pub const fn all(weight: f32) -> Self {
+                Self { $($name: weight),* }
+            }
+
+            /// One term alone.
+            pub const fn only(term_ix: usize, weight: f32) -> Self {
+                let mut weights = Self::all(0.0);
+                let mut ix = 0;
+                $(
+                    if ix == term_ix {
+                        weights.$name = weight;
+                    }
+                    ix += 1;
+                )*
+                assert!(term_ix < ix, "no term has this number");
+                weights
+            }
+        }
+
+        /// The fields that `#import loss_weights` puts into `Step`.
+        pub(crate) const WGSL_FIELDS: &str =
+            concat!($("    ", stringify!($name), "_weight: f32,\n"),*);
+    };
+}
+
+loss_weights! {
+    /// Of the depth loss, as `StepSettings::depth_mode` says.
+    depth,
+    /// Of the mean opacity over the visible splats (3DGS-MCMC regulariser).
+    opacity,
+    /// Of the mean scale over the visible splats, per world unit (3DGS-MCMC regulariser).
+    scale,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_term_alone_is_the_one_of_that_name() {
+        for (ix, name) in LossWeights::NAMES.iter().enumerate() {
+            let weights = LossWeights::only(ix, 3.0);
+            let text = format!("{weights:?}");
+            assert!(text.contains(&format!("{name}: 3.0")), "{text}");
+            assert_eq!(text.matches("3.0").count(), 1, "{text}");
+            assert!(WGSL_FIELDS.contains(&format!("{name}_weight: f32,")));
+        }
+    }
+}
