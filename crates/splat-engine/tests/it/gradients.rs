@@ -72,6 +72,10 @@ fn check_terms(sh_degree: u8, seed: u64) {
     for (name, weights) in photometric.into_iter().chain(stretched).chain(terms) {
         let problem = Problem::new(eventful_scene(seed, sh_degree), weights, sh_degree);
         let claimed = problem.gradients(&problem.point);
+        assert_ne!(
+            claimed.loss.total, 0.0,
+            "{name} is declared and does nothing"
+        );
         if let Err(reason) = problem.check(&claimed) {
             panic!("{name}, degree {sh_degree}, seed {seed}: {reason}");
         }
