@@ -296,8 +296,8 @@ fn measure_quality(
             };
             let psnr = image_metrics::psnr(&rendering.rgb, &photo);
             psnrs.push(psnr);
-            ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
             if is_held_out {
+                ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
                 distances.extend(lpips_of(&mut lpips, &rendering, &photo));
             }
             if i % image_stride == 0 {
