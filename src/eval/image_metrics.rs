@@ -1,4 +1,4 @@
-//! A rendering and a photo of the same size -> PSNR and SSIM, in f64.
+//! A rendering and a photo of the same size -> SSIM, in f64.
 //!
 //! Colour is the stored sRGB value / 255, as everywhere in the engine. Renderings are clamped to 0..1 as a screen would.
 
@@ -12,22 +12,6 @@ const WINDOW_SIGMA: f64 = 1.5;
 /// (K1 L)² and (K2 L)² with K1 = 0.01, K2 = 0.03 and L = 1 (same paper).
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
-
-/// Peak signal-to-noise ratio in dB over all pixels and channels; infinite for equal images.
-/// `rendered` holds r g b per pixel, as `Rendering::rgb`.
-pub fn psnr(rendered: &[f32], photo: &RgbImage) -> f64 {
-    assert_eq!(
-        rendered.len(),
-        photo.pixels.len(),
-        "a rendering is compared with a photo of its size"
-    );
-    let squares = rendered
-        .iter()
-        .zip(&photo.pixels)
-        .map(|(&r, &p)| (shown(r) - f64::from(p) / 255.0).powi(2));
-    let mean_square = squares.sum::<f64>() / rendered.len() as f64;
-    -10.0 * mean_square.log10()
-}
 
 /// Mean structural similarity: over the windows that lie wholly inside the image, then over the channels.
 /// An image with a side below 11 px gets the largest odd window that fits it.
@@ -170,36 +154,6 @@ mod tests {
             }
         }
         total / n
-    }
-
-    #[test]
-    fn psnr_of_a_known_error_is_as_by_hand() {
-        let photo = RgbImage {
-            width_px: 2,
-            height_px: 1,
-            pixels: vec![0, 51, 102, 153, 204, 255],
-        };
-        let off_by_a_tenth: Vec<f32> = vec![0.1, 0.3, 0.3, 0.7, 0.7, 0.9];
-        assert!(
-            (psnr(&off_by_a_tenth, &photo) - 20.0).abs() < 1e-5,
-            "f32 inputs"
-        );
-        let one_wrong = [1.0, 0.2, 0.4, 0.6, 0.8, 1.0];
-        assert!((psnr(&one_wrong, &photo) - 10.0 * 6f64.log10()).abs() < 1e-5);
-    }
-
-    #[test]
-    fn values_outside_the_screen_count_as_clamped() {
-        let photo = RgbImage {
-            width_px: 1,
-            height_px: 1,
-            pixels: vec![0, 255, 255],
-        };
-        assert_eq!(psnr(&[-3.0, 7.0, 1.0], &photo), f64::INFINITY);
-        assert!(
-            psnr(&[f32::NAN, 1.0, 1.0], &photo).is_nan(),
-            "a broken rendering must not look good"
-        );
     }
 
     #[test]

@@ -294,7 +294,7 @@ fn measure_quality(
             let Some((rendering, photo)) = shown else {
                 continue;
             };
-            let psnr = image_metrics::psnr(&rendering.rgb, &photo);
+            let psnr = rendering.psnr(&photo);
             psnrs.push(psnr);
             if is_held_out {
                 ssims.push(image_metrics::ssim(&rendering.rgb, &photo));

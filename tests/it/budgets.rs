@@ -8,7 +8,6 @@ use splat_engine::traits::Engine;
 use splat_geometry::ground_truth::model::GroundTruthModel;
 use splat_geometry::model::GeometryModel;
 use splat_io::frame_source::Source;
-use splat_mapper::eval::image_metrics::psnr;
 use splat_mapper::node::page_file::PageFile;
 use splat_mapper::node::save_map::{MapFile, save_map};
 use splat_mapper::params::settings::Settings;
@@ -113,7 +112,7 @@ impl Walk {
         let n = ids.len() as f64;
         let of = |id| {
             let (shown, photo) = self.map.render_keyframe(id).unwrap().unwrap();
-            psnr(&shown.rgb, &photo)
+            shown.psnr(&photo)
         };
         ids.map(of).sum::<f64>() / n
     }

@@ -8,7 +8,6 @@ use crate::loops::{Filmed, film};
 use crate::sfm::params;
 use splat_engine::cpu::engine::CpuEngine;
 use splat_geometry::answer::{GeometryBatch, PoseUpdate, View};
-use splat_mapper::eval::image_metrics;
 use splat_slam::mapper::mapper::Mapper;
 use splat_types::correction::Reason;
 use splat_types::frame::Batch;
@@ -86,7 +85,7 @@ fn motion() -> Similarity {
 fn assert_same_images(map: &mut Mapper, before: &[RgbImage]) {
     for (id, before) in (0..).zip(before) {
         let (rendering, _) = map.render_keyframe(id).unwrap().unwrap();
-        let psnr = image_metrics::psnr(&rendering.rgb, before);
+        let psnr = rendering.psnr(before);
         assert!(psnr > SAME_DB, "keyframe {id}: {psnr:.1} dB");
     }
 }

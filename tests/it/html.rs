@@ -8,7 +8,6 @@ use glam::{DQuat, DVec3};
 use serde_json::Value;
 
 use crate::report::sample_report;
-use splat_mapper::eval::image_metrics::psnr;
 use splat_mapper::eval::report_json::Report;
 use splat_mapper::eval::trajectory::TimedPose;
 use splat_mapper::params::settings::defaults;
@@ -74,7 +73,7 @@ fn comparison(keyframe_id: u32, width_px: u32, height_px: u32) -> Comparison {
         keyframe_id as usize,
         0.3 + 0.02 * f64::from(keyframe_id),
     );
-    let psnr = psnr(&rendering.rgb, &photo);
+    let psnr = rendering.psnr(&photo);
     Comparison {
         keyframe_id,
         held_out: keyframe_id % 8 == 4,

@@ -11,7 +11,6 @@ use splat_geometry::answer::{GeometryBatch, PoseQuality, View};
 use splat_geometry::ground_truth::noise::{Noise, answer};
 use splat_geometry::sfm::estimator::Sfm;
 use splat_mapper::eval::alignment::align;
-use splat_mapper::eval::image_metrics;
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::train::schedule::Phase;
 use splat_synth::settings::SynthSettings;
@@ -324,7 +323,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<MapCorrection>
         .filter(|(_, held_out)| *held_out)
     {
         let (rendering, photo) = map.render_keyframe(id).unwrap().unwrap();
-        let psnr = image_metrics::psnr(&rendering.rgb, &photo);
+        let psnr = rendering.psnr(&photo);
         if id < SEAM || id + SEAM >= end {
             &mut seam
         } else {

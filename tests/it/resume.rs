@@ -10,7 +10,6 @@ use splat_engine::cpu::engine::CpuEngine;
 use splat_engine::traits::{Renderer as _, SplatBuffers as _};
 use splat_geometry::similarity;
 use splat_io::frame_source::{Source, SourceCounts};
-use splat_mapper::eval::image_metrics::psnr;
 use splat_mapper::node::engines::Engines;
 use splat_mapper::node::job::{Job, Outcome};
 use splat_mapper::node::open_source::open;
@@ -151,7 +150,7 @@ fn quality(outcome: &Outcome, keyframes: &[(u32, &RgbImage)]) -> f64 {
                 outcome.snapshot.splats.sh_degree,
             )
             .unwrap();
-        psnr(&shown.rgb, &photo)
+        shown.psnr(&photo)
     };
     keyframes
         .iter()

@@ -37,6 +37,17 @@ pub struct Correspondence {
 }
 
 impl TrainingView {
+    /// A photo and its camera, without depth, every pixel counting in full.
+    pub fn new(image: Arc<RgbImage>, intrinsics: Intrinsics, cam_from_world: Rigid) -> Self {
+        Self {
+            image,
+            intrinsics,
+            cam_from_world,
+            depth: None,
+            mask: None,
+        }
+    }
+
     /// Our own mistake when it fails.
     pub(crate) fn assert_consistent(&self) {
         let (image, intrinsics) = (&self.image, &self.intrinsics);
