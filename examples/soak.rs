@@ -134,8 +134,8 @@ fn settings(n: u64) -> StepSettings {
         lr_exposure: 1e-4,
         ssim_weight: 0.2,
         weights: LossWeights {
-            opacity: 0.01,
-            scale: 0.01,
+            opacity_reg: 0.01,
+            scale_reg: 0.01,
             ..LossWeights::default()
         },
         noise: 0.05,

@@ -126,11 +126,11 @@ fn gradient_of(visible_ix: u32, splat: Projected, shape: Shape, mean: vec3<f32>)
         dot(shape.rotation[2], g_root[2]),
     );
     let per_visible = 1.0 / f32(camera.n_visible);
-    let g_opacity = -sum0.x / shape.opacity + step.opacity_weight * per_visible;
+    let g_opacity = -sum0.x / shape.opacity + step.opacity_reg * per_visible;
     g.mean = back * g_in_cam + by_direction;
     g.opacity_logit = g_opacity * shape.opacity * (1.0 - shape.opacity);
     g.quat = quat_gradient(shape, mat3x3<f32>(g_root[0] * shape.scale.x, g_root[1] * shape.scale.y, g_root[2] * shape.scale.z));
-    g.log_scale = shape.scale * (g_scale + step.scale_weight * per_visible / 3.0);
+    g.log_scale = shape.scale * (g_scale + step.scale_reg * per_visible / 3.0);
     g.rho = g_in_cam + to_cam * by_direction;
     let twist = cov * g_cov - g_cov * cov;
     g.theta = cross(shape.in_cam, g_in_cam) + 2.0 * vec3<f32>(twist[2].y, twist[0].z, twist[1].x);

@@ -66,7 +66,7 @@ fn note_stats() {
     let mask = 3.0 * step.mask_sum;
     let ssim = select(1.0, totals[6].x / mask, mask > 0.0);
     let n = max(totals[2].z, 1.0);
-    let regulariser = step.opacity_weight * totals[2].x / n + step.scale_weight * totals[2].y / (3.0 * n);
+    let regulariser = step.opacity_reg * totals[2].x / n + step.scale_reg * totals[2].y / (3.0 * n);
     let loss = (1.0 - step.ssim_weight) * totals[3].x + step.ssim_weight * (1.0 - ssim)
         + step.depth_weight * totals[3].y + totals[3].z + regulariser;
     stats[0] += 1.0;

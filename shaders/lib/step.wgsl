@@ -34,7 +34,7 @@ struct Step {
     noise: f32,
     noise_seed: u32,
     ssim_weight: f32,
-    // NAME_weight of each term, as loss_weights.rs of splat-engine declares them.
+    // Weights of the loss's terms, as loss_weights.rs of splat-engine declares them.
 #import loss_weights
     // Sum of the pixels' weights, and of their depth confidences.
     mask_sum: f32,

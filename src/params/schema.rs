@@ -105,6 +105,7 @@ pub fn allows(range: &Range, value: &Value) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat_engine::loss_weights::LossWeights;
 
     #[test]
     fn every_parameter_has_a_text_and_every_number_both_bounds() {
@@ -139,6 +140,15 @@ mod tests {
         assert_eq!(descriptors()["backend"].range, Range::Choice(names));
         assert_eq!(descriptors()["geometry"].range, Range::Text);
         assert_eq!(descriptors()["sequential"].range, Range::Flag);
+    }
+
+    #[test]
+    fn every_weight_of_the_loss_is_a_parameter() {
+        for name in LossWeights::NAMES {
+            let keys = ["train", "mcmc"].map(|group| format!("{group}.{name}"));
+            let found = keys.iter().filter(|key| descriptors().contains_key(*key));
+            assert_eq!(found.count(), 1, "{name}");
+        }
     }
 
     #[test]

@@ -118,7 +118,7 @@ fn the_step_has_the_layout_of_the_host() {
     );
     let weights = LossWeights::NAMES.iter().enumerate().map(|(ix, name)| {
         let offset = offset_of!(Step, weights) + ix * size_of::<f32>();
-        (format!("{name}_weight"), offset, f32::NAME.to_owned())
+        ((*name).to_owned(), offset, f32::NAME.to_owned())
     });
     step.0.extend(weights);
     step.0.sort_by_key(|(_, offset, _)| *offset);

@@ -1,16 +1,19 @@
 //! Weights of the terms of the loss: each is declared here once, for the settings of a step, for both backends, for the
-//! shaders and for the tests that prove its gradient.
+//! shaders, for the tests that prove its gradient, and as a parameter of whoever trains with it.
 
 use bytemuck::{Pod, Zeroable};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
-/// A field of `LossWeights`, and `NAME_weight: f32` of `Step` in `shaders/lib/step.wgsl`, for each term.
+/// A field of `LossWeights`, and of `Step` in `shaders/lib/step.wgsl`, for each term.
 macro_rules! loss_weights {
-    ($($(#[$doc:meta])* $name:ident,)*) => {
-        /// Weights of the terms that are added to the photometric loss; 0 turns a term off.
-        #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+    ($($(#[$attribute:meta])* $name:ident,)*) => {
+        /// Weights of the terms that are added to the photometric loss; 0 turns a term off. What serde writes are the mapper's
+        /// parameters `train.*`, with these texts; a decay over the run is the mapper's.
+        #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, Serialize, Deserialize, JsonSchema)]
         #[repr(C)]
         pub struct LossWeights {
-            $($(#[$doc])* pub $name: f32,)*
+            $($(#[$attribute])* #[schemars(range(min = 0.0, max = 100.0))] pub $name: f32,)*
         }
 
         impl LossWeights {
@@ -39,17 +42,19 @@ macro_rules! loss_weights {
 
         /// The fields that `#import loss_weights` puts into `Step`.
         pub(crate) const WGSL_FIELDS: &str =
-            concat!($("    ", stringify!($name), "_weight: f32,\n"),*);
+            concat!($("    ", stringify!($name), ": f32,\n"),*);
     };
 }
 
 loss_weights! {
-    /// Of the depth loss, as `StepSettings::depth_mode` says.
-    depth,
-    /// Of the mean opacity over the visible splats (3DGS-MCMC regulariser).
-    opacity,
-    /// Of the mean scale over the visible splats, per world unit (3DGS-MCMC regulariser).
-    scale,
+    /// Weight of the depth loss; decays to a tenth over the run.
+    depth_weight,
+    /// Weight of the mean opacity over the visible splats (3DGS-MCMC regulariser); the mapper's `mcmc.opacity_reg`.
+    #[serde(skip)]
+    opacity_reg,
+    /// Weight of the mean scale over the visible splats, per world unit (3DGS-MCMC regulariser); the mapper's `mcmc.scale_reg`.
+    #[serde(skip)]
+    scale_reg,
 }
 
 #[cfg(test)]
@@ -63,7 +68,7 @@ mod tests {
             let text = format!("{weights:?}");
             assert!(text.contains(&format!("{name}: 3.0")), "{text}");
             assert_eq!(text.matches("3.0").count(), 1, "{text}");
-            assert!(WGSL_FIELDS.contains(&format!("{name}_weight: f32,")));
+            assert!(WGSL_FIELDS.contains(&format!("{name}: f32,")));
         }
     }
 }

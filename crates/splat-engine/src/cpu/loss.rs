@@ -53,7 +53,9 @@ pub fn loss(
     let weight = f64::from(settings.ssim_weight);
     let mut value = photo_loss(raster, target, weight, out);
     value.depth = match target.depth {
-        Some(depth) if settings.weights.depth > 0.0 => depth_gradient(raster, depth, settings, out),
+        Some(depth) if settings.weights.depth_weight > 0.0 => {
+            depth_gradient(raster, depth, settings, out)
+        }
         _ => {
             out.planes[3].fill(0.0);
             out.planes[4].fill(0.0);
@@ -61,7 +63,7 @@ pub fn loss(
         }
     };
     value.total = (1.0 - weight) * value.l1 + weight * (1.0 - value.ssim);
-    value.total += f64::from(settings.weights.depth) * value.depth;
+    value.total += f64::from(settings.weights.depth_weight) * value.depth;
     value
 }
 

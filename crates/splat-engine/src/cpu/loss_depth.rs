@@ -39,8 +39,10 @@ pub(crate) fn depth_gradient(
     map_columns
         .extend((0..raster.width_px).map(|x| (2 * x + 1) * map_width / (2 * raster.width_px)));
     match settings.depth_mode {
-        DepthMode::InverseDepth => inverse_gradient(raster, map, settings.weights.depth, out),
-        mode => stretched_gradient(raster, map, mode, settings.weights.depth, out),
+        DepthMode::InverseDepth => {
+            inverse_gradient(raster, map, settings.weights.depth_weight, out)
+        }
+        mode => stretched_gradient(raster, map, mode, settings.weights.depth_weight, out),
     }
 }
 

@@ -168,8 +168,9 @@ impl Forward<'_> {
 
         let opacity = f64::from(sigmoid(self.splats.opacity_logits[ix]));
         let n_visible = self.visible.len() as f64;
-        let g_opacity = f64::from(sums.opacity) + f64::from(settings.weights.opacity) / n_visible;
-        let g_scale = g_scale + f64::from(settings.weights.scale) / (3.0 * n_visible);
+        let g_opacity =
+            f64::from(sums.opacity) + f64::from(settings.weights.opacity_reg) / n_visible;
+        let g_scale = g_scale + f64::from(settings.weights.scale_reg) / (3.0 * n_visible);
         partial.opacity += opacity;
         partial.scale += shape.scale.element_sum();
 
@@ -368,7 +369,7 @@ impl SplatGradients {
         ];
         self.log_focal = sum.log_focal;
         let n = self.means.len().max(1) as f64;
-        self.regulariser = f64::from(settings.weights.opacity) * sum.opacity / n
-            + f64::from(settings.weights.scale) * sum.scale / (3.0 * n);
+        self.regulariser = f64::from(settings.weights.opacity_reg) * sum.opacity / n
+            + f64::from(settings.weights.scale_reg) * sum.scale / (3.0 * n);
     }
 }

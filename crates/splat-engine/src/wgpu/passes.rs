@@ -172,7 +172,7 @@ pub(crate) fn backward(
         &p.loss_sums,
     ];
     commands.dispatch(&PHOTO_GRADIENT, &photo, in_columns)?;
-    if step.depth_mode != 0 && step.depth_width > 0 && step.weights.depth > 0.0 {
+    if step.depth_mode != 0 && step.depth_width > 0 && step.weights.depth_weight > 0.0 {
         let stretch = [
             &frame.step,
             &p.image,

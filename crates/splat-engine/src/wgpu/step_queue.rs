@@ -142,8 +142,9 @@ impl WgpuEngine {
         let s = settings;
         let [depth_width, depth_height] = view.depth_size();
         let image = &view.training.image;
-        let has_depth =
-            depth_width > 0 && s.weights.depth > 0.0 && s.depth_mode == DepthMode::InverseDepth;
+        let has_depth = depth_width > 0
+            && s.weights.depth_weight > 0.0
+            && s.depth_mode == DepthMode::InverseDepth;
         let flag = |is_set: bool, flag: u32| if is_set { flag } else { 0 };
         let flags = flag(s.train_splats, FLAG_TRAIN_SPLATS)
             | flag(s.moves_alone(), FLAG_POSE_DIRECT)

@@ -92,7 +92,7 @@ fn emphases() -> Vec<(String, StepSettings)> {
     };
     let depth = |depth_mode| StepSettings {
         weights: LossWeights {
-            depth: 30.0,
+            depth_weight: 30.0,
             ..LossWeights::default()
         },
         depth_mode,
@@ -216,7 +216,7 @@ fn compare(
     if settings.ssim_weight > 0.0 {
         losses.push((found.ssim, reference.loss.ssim));
     }
-    if settings.weights.depth > 0.0 {
+    if settings.weights.depth_weight > 0.0 {
         losses.push((found.depth, reference.loss.depth));
     }
     errors[8] = losses

@@ -379,7 +379,7 @@ fn settings() -> StepSettings {
         lr_pose_translation: 1e-5,
         ssim_weight: 0.2,
         weights: LossWeights {
-            depth: 0.05,
+            depth_weight: 0.05,
             ..LossWeights::all(0.001)
         },
         sh_degree: 3,

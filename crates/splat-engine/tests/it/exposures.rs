@@ -104,7 +104,7 @@ fn the_pull_keeps_the_common_exposure_at_zero() {
         lr_exposure: 0.01,
         pose: PoseMode::Held,
         weights: LossWeights {
-            depth: 0.0,
+            depth_weight: 0.0,
             ..random::settings().weights
         },
         ..random::settings()
@@ -163,8 +163,8 @@ fn a_mask_of_ones_changes_no_bit_and_one_of_zeros_gives_no_loss() {
             .unwrap();
         let settings = StepSettings {
             weights: LossWeights {
-                opacity: 0.0,
-                scale: 0.0,
+                opacity_reg: 0.0,
+                scale_reg: 0.0,
                 ..random::settings().weights
             },
             ..random::settings()
@@ -197,7 +197,7 @@ fn hostile_scenes_stay_finite_with_every_mode_on() {
                 let settings = StepSettings {
                     depth_mode: modes[step % 3],
                     weights: LossWeights {
-                        depth: 1.0,
+                        depth_weight: 1.0,
                         ..random::settings().weights
                     },
                     lr_exposure: 0.5,

@@ -17,7 +17,7 @@ const L1: Weights = Weights { l1: 1.0, ..NONE };
 const SSIM: Weights = Weights { ssim: 1.0, ..NONE };
 const DEPTH: Weights = Weights {
     terms: LossWeights {
-        depth: 1.0,
+        depth_weight: 1.0,
         ..NONE.terms
     },
     ..NONE
@@ -34,7 +34,7 @@ const ALL: Weights = Weights {
     l1: 0.8,
     ssim: 0.2,
     terms: LossWeights {
-        depth: 0.3,
+        depth_weight: 0.3,
         ..LossWeights::all(0.1)
     },
     ..NONE
@@ -226,8 +226,8 @@ fn a_image_of_which_no_pixel_counts_has_no_loss_and_no_gradient() {
     scene.view.mask = Some(vec![0; n_pixels].into());
     let weights = Weights {
         terms: LossWeights {
-            opacity: 0.0,
-            scale: 0.0,
+            opacity_reg: 0.0,
+            scale_reg: 0.0,
             ..ALL.terms
         },
         ..ALL

@@ -3,6 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use splat_engine::loss_weights::LossWeights;
+
 /// All that the map needs.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct MapperParams {
@@ -84,9 +86,9 @@ pub struct TrainParams {
     /// Share of 1 - SSIM in the photometric loss.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub ssim_weight: f32,
-    /// Weight of the depth loss; decays to a tenth over the run.
-    #[schemars(range(min = 0.0, max = 100.0))]
-    pub depth_weight: f32,
+    /// Weights of the further terms of the loss, each under its own name: `train.depth_weight` and what else the engine declares.
+    #[serde(flatten)]
+    pub weights: LossWeights,
     /// What the depth loss compares: inverse depth; as the code of FastSplatting; as its paper.
     pub depth_mode: DepthLoss,
     /// Weight of the epipolar distance in px over the correspondences of a view (3R-GS); 0 = off.
@@ -142,7 +144,10 @@ impl Default for TrainParams {
             seeds_per_keyframe: 2500,
             sh_degree: 1,
             ssim_weight: 0.2,
-            depth_weight: 0.1,
+            weights: LossWeights {
+                depth_weight: 0.1,
+                ..LossWeights::default()
+            },
             depth_mode: DepthLoss::InvDepth,
             epipolar_weight: 0.0,
             robust_inlier_fraction: 1.0,

@@ -52,8 +52,9 @@ pub fn loss(raster: &Raster, target: &Target, weights: &Weights) -> Loss {
     }
     let (mut v_alpha, mut v_depth_sum) = (vec![0.0; n], vec![0.0; n]);
     let (depth, depth_decisions) = depth(raster, target, weights, [&mut v_alpha, &mut v_depth_sum]);
-    let total =
-        weights.l1 * l1 + weights.ssim * (1.0 - ssim) + f64::from(weights.terms.depth) * depth;
+    let total = weights.l1 * l1
+        + weights.ssim * (1.0 - ssim)
+        + f64::from(weights.terms.depth_weight) * depth;
     Loss {
         total,
         l1,
@@ -155,7 +156,8 @@ pub fn regularise(
     v_splats: &mut Params,
 ) -> f64 {
     let n = visible.len().max(1) as f64;
-    let [by_opacity, by_scale] = [weights.terms.opacity, weights.terms.scale].map(f64::from);
+    let [by_opacity, by_scale] =
+        [weights.terms.opacity_reg, weights.terms.scale_reg].map(f64::from);
     let mut total = 0.0;
     for &ix in visible {
         let opacity = sigmoid(params.opacity_logits[ix]);

@@ -22,14 +22,14 @@ pub struct Decisions {
     pub margin: f64,
 }
 
-/// Adds `weights.terms.depth` times the gradient. Returns the loss before its weight.
+/// Adds `weights.terms.depth_weight` times the gradient. Returns the loss before its weight.
 pub fn depth(
     raster: &Raster,
     target: &Target,
     weights: &Weights,
     v: [&mut [f64]; 2],
 ) -> (f64, Decisions) {
-    let weight = f64::from(weights.terms.depth);
+    let weight = f64::from(weights.terms.depth_weight);
     match weights.depth_mode {
         DepthMode::InverseDepth => inverse(raster, target, weight, v),
         DepthMode::PaperCode => stretched(raster, target, weight, false, v),

@@ -61,7 +61,7 @@ pub fn settings() -> StepSettings {
         lr_pose_translation: 2e-3,
         ssim_weight: 0.2,
         weights: LossWeights {
-            depth: 0.1,
+            depth_weight: 0.1,
             ..LossWeights::all(0.01)
         },
         sh_degree: 3,

@@ -103,11 +103,13 @@ pub fn settings(
     let sh_is_on = params.train.sh_interval > 0 || (phase != Phase::Streaming && done >= SH_START);
     let lr_mean = decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
-    let mut weights = LossWeights::all(0.0);
-    weights.depth = decayed(params.train.depth_weight, FINAL_DEPTH_WEIGHT);
-    weights.opacity = if_mcmc(params.mcmc.opacity_reg);
-    // A scale is a length: its share of the scene is what has a size.
-    weights.scale = if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE));
+    let weights = LossWeights {
+        depth_weight: decayed(params.train.weights.depth_weight, FINAL_DEPTH_WEIGHT),
+        opacity_reg: if_mcmc(params.mcmc.opacity_reg),
+        // A scale is a length: its share of the scene is what has a size.
+        scale_reg: if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE)),
+        ..params.train.weights
+    };
     StepSettings {
         lr_mean,
         lr_scale: params.train.lr_scale,
@@ -184,6 +186,19 @@ mod tests {
             .count();
         // Half by preference, a tenth of the other half by chance.
         assert!((480..620).contains(&newest), "{newest}");
+    }
+
+    #[test]
+    fn a_weight_of_the_loss_reaches_the_step_without_a_line_of_its_own() {
+        let mut params = MapperParams::default();
+        params.train.weights = LossWeights::all(2.0);
+        let expected = LossWeights {
+            opacity_reg: 0.0,
+            scale_reg: 0.0,
+            ..LossWeights::all(2.0)
+        };
+        let found = settings(&params, 2.0, [0.0; 2], Phase::Streaming);
+        assert_eq!(found.weights, expected, "without mcmc.enabled");
     }
 
     #[test]
