@@ -5,7 +5,6 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization};
-use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
 /// Share of the steps between arrivals that train on the newest views.
@@ -103,13 +102,12 @@ pub fn settings(
     let sh_is_on = params.train.sh_interval > 0 || (phase != Phase::Streaming && done >= SH_START);
     let lr_mean = decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
-    let weights = LossWeights {
-        depth_weight: decayed(params.train.weights.depth_weight, FINAL_DEPTH_WEIGHT),
-        opacity_reg: if_mcmc(params.mcmc.opacity_reg),
-        // A scale is a length: its share of the scene is what has a size.
-        scale_reg: if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE)),
-        ..params.train.weights
-    };
+    // Terms that have no say below have the weight of the parameters.
+    let mut weights = params.train.weights;
+    weights.depth_weight = decayed(weights.depth_weight, FINAL_DEPTH_WEIGHT);
+    weights.opacity_reg = if_mcmc(params.mcmc.opacity_reg);
+    // A scale is a length: its share of the scene is what has a size.
+    weights.scale_reg = if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE));
     StepSettings {
         lr_mean,
         lr_scale: params.train.lr_scale,
@@ -161,6 +159,7 @@ fn pose_step(params: &MapperParams) -> PoseMode {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use splat_engine::loss_weights::LossWeights;
 
     #[test]
     fn a_final_round_visits_every_view_once() {
