@@ -38,9 +38,7 @@
 //!
 //! let mut engine = CpuEngine::new();
 //! engine.append(&splats)?;
-//! let view_ix = engine.add_view(TrainingView {
-//!     image: Arc::new(image), intrinsics, cam_from_world, depth: None, mask: None,
-//! })?;
+//! let view_ix = engine.add_view(TrainingView::new(Arc::new(image), intrinsics, cam_from_world))?;
 //! let settings = StepSettings {
 //!     lr_mean: 1e-3, lr_scale: 5e-3, lr_quat: 1e-3, lr_opacity: 5e-2, lr_sh0: 5e-2,
 //!     ssim_weight: 0.2, train_splats: true, ..StepSettings::default()
