@@ -1,13 +1,13 @@
 //! Frames -> keyframes, by image motion -> batches of keyframes.
 
-mod grey;
+pub(crate) mod grey;
 
 pub mod params;
 
 mod window;
 
-mod optical_flow;
+pub(crate) mod optical_flow;
 
-mod motion;
+pub(crate) mod motion;
 
 pub mod selector;

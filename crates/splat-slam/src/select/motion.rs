@@ -20,9 +20,14 @@ const FIT_ROUNDS: usize = 10;
 
 /// Grey 0..1, box-filtered down to at most `TRACK_SIDE_PX`.
 pub(crate) fn small_grey(image: &RgbImage) -> GreyImage {
+    grey_of_side(image, TRACK_SIDE_PX)
+}
+
+/// Grey 0..1, its longer side divided by a whole number so that it is at most `max_side_px`.
+pub(crate) fn grey_of_side(image: &RgbImage, max_side_px: u32) -> GreyImage {
     let (width, height) = (image.width_px as usize, image.height_px as usize);
     let factor = (image.width_px.max(image.height_px))
-        .div_ceil(TRACK_SIDE_PX)
+        .div_ceil(max_side_px)
         .max(1) as usize;
     let (small_width, small_height) = ((width / factor).max(1), (height / factor).max(1));
     let norm = 1.0 / (255.0 * 4.0 * (factor * factor) as f32);
@@ -72,24 +77,36 @@ pub(crate) fn sharpness(grey: &GreyImage) -> f32 {
 
 /// The strongest corner of each grid cell.
 pub(crate) fn corners(grey: &GreyImage) -> Vec<[f32; 2]> {
+    corners_in_cells(grey, CELL_PX, MIN_CORNER_RESPONSE, |_| true)
+}
+
+/// The strongest corner of each cell of `cell_px` that is asked for, by its column and row, where the smaller eigenvalue of
+/// its structure tensor is above `min_response`.
+pub(crate) fn corners_in_cells(
+    grey: &GreyImage,
+    cell_px: usize,
+    min_response: f32,
+    is_asked: impl Fn([usize; 2]) -> bool,
+) -> Vec<[f32; 2]> {
     let (width, height) = grey.size();
-    if width < 2 * CELL_PX || height < 2 * CELL_PX {
+    if width < 2 * cell_px || height < 2 * cell_px {
         return Vec::new();
     }
     let response = corner_response(grey);
     let mut found = Vec::new();
-    for cell_y in (0..height).step_by(CELL_PX) {
-        for cell_x in (0..width).step_by(CELL_PX) {
+    for cell_y in (0..height).step_by(cell_px) {
+        for cell_x in (0..width).step_by(cell_px) {
+            if !is_asked([cell_x / cell_px, cell_y / cell_px]) {
+                continue;
+            }
             let (ys, xs) = (
-                cell_y..(cell_y + CELL_PX).min(height),
-                cell_x..(cell_x + CELL_PX).min(width),
+                cell_y..(cell_y + cell_px).min(height),
+                cell_x..(cell_x + cell_px).min(width),
             );
             let pixels = ys.flat_map(|y| xs.clone().map(move |x| (x, y)));
             let best = pixels
                 .max_by(|a, b| response[a.1 * width + a.0].total_cmp(&response[b.1 * width + b.0]));
-            if let Some((x, y)) =
-                best.filter(|(x, y)| response[y * width + x] > MIN_CORNER_RESPONSE)
-            {
+            if let Some((x, y)) = best.filter(|(x, y)| response[y * width + x] > min_response) {
                 found.push([x as f32, y as f32]);
             }
         }

@@ -10,6 +10,8 @@ use crate::select::window::Window;
 const MAX_ITERATIONS: usize = 15;
 /// A step shorter than this has converged.
 const MIN_STEP_PX: f32 = 0.01;
+/// Levels on which a point is looked for that is expected within some 20 pixels.
+const LEVELS_NEAR: usize = 2;
 
 /// An image at full size, half, quarter, and so on, with derivatives.
 #[derive(Debug, Clone)]
@@ -51,6 +53,11 @@ impl Pyramid {
     pub(crate) fn image(&self) -> &GreyImage {
         &self.levels[0].image
     }
+
+    /// The image at half size, where there is one.
+    pub(crate) fn half(&self) -> Option<&GreyImage> {
+        self.levels.get(1).map(|level| &level.image)
+    }
 }
 
 /// Follows pixel positions of `from` into `to`, an image of the same size; `None` where the window has too little
@@ -63,13 +70,41 @@ pub(crate) fn optical_flow(
     assert_eq!(from.image().size(), to.image().size(), "images of one size");
     points
         .par_iter()
-        .map(|point| follow(from, to, *point))
+        .map(|point| follow(from, to, *point, [0.0; 2], usize::MAX))
         .collect()
 }
 
-fn follow(from: &Pyramid, to: &Pyramid, point: [f32; 2]) -> Option<Found> {
-    let mut shift = [0.0_f32; 2];
-    for (level_ix, (from, to)) in from.levels.iter().zip(&to.levels).enumerate().rev() {
+/// The same, begun where a point is expected: (point, where it may be now). Who is expected near is looked for on the finest
+/// levels alone.
+pub(crate) fn optical_flow_near(
+    from: &Pyramid,
+    to: &Pyramid,
+    points: &[([f32; 2], Option<[f32; 2]>)],
+) -> Vec<Option<Found>> {
+    assert_eq!(from.image().size(), to.image().size(), "images of one size");
+    let follow = |(point, near): &([f32; 2], Option<[f32; 2]>)| match near {
+        Some(near) => {
+            let shift = [near[0] - point[0], near[1] - point[1]];
+            follow(from, to, *point, shift, LEVELS_NEAR)
+        }
+        None => follow(from, to, *point, [0.0; 2], usize::MAX),
+    };
+    points.par_iter().map(follow).collect()
+}
+
+/// `expected`: the shift to begin with, at full size. Of the levels, the `n_levels` finest.
+fn follow(
+    from: &Pyramid,
+    to: &Pyramid,
+    point: [f32; 2],
+    expected: [f32; 2],
+    n_levels: usize,
+) -> Option<Found> {
+    let n_levels = n_levels.min(from.levels.len());
+    let coarsest = 0.5_f32.powi(n_levels.saturating_sub(1) as i32);
+    let mut shift = expected.map(|v| v * coarsest);
+    let levels = from.levels.iter().zip(&to.levels).take(n_levels);
+    for (level_ix, (from, to)) in levels.enumerate().rev() {
         let scale = 0.5_f32.powi(level_ix as i32);
         let centre = point.map(|v| v * scale);
         let window = Window::cut(&from.image, &from.gradients, centre);

@@ -12,6 +12,7 @@ const HALF: usize = WINDOW / 2;
 const LANES: usize = 8;
 const LANE_COLUMNS: usize = WINDOW - WINDOW % LANES;
 const N_PIXELS: usize = WINDOW * WINDOW;
+const PATCH: usize = WINDOW + 1;
 /// Per pixel of the window, the smaller eigenvalue of the structure tensor below which a point has no definite place.
 const MIN_EIGENVALUE: f32 = 1e-4;
 /// A structure tensor of a smaller determinant is not inverted.
@@ -48,23 +49,16 @@ impl Window {
             gradients: [[0.0; N_PIXELS]; 2],
             tensor: [0.0; 3],
         };
-        match Samples::of(image.size(), centre) {
-            Some(samples) => cut_inside(&mut window, image, gradients, samples),
-            None => window.cut_at_border(image, gradients, centre),
+        if let Some(samples) = Samples::of(image.size(), centre) {
+            let gradients = gradients.each_ref().map(Pixels::of);
+            cut_inside(&mut window, Pixels::of(image), gradients, samples);
+        } else {
+            let (patch, samples) = patch_at_border(image, centre);
+            let patches = gradients.each_ref().map(|g| patch_at_border(g, centre).0);
+            let gradients = patches.each_ref().map(Pixels::of_patch);
+            cut_inside(&mut window, Pixels::of_patch(&patch), gradients, samples);
         }
         window
-    }
-
-    fn cut_at_border(&mut self, image: &GreyImage, [gx, gy]: &[GreyImage; 2], centre: [f32; 2]) {
-        let [a, b, c] = &mut self.tensor;
-        for (p, at) in positions(centre).enumerate() {
-            self.image[p] = clamped(image, at);
-            let (x, y) = (clamped(gx, at), clamped(gy, at));
-            (self.gradients[0][p], self.gradients[1][p]) = (x, y);
-            *a += x * x;
-            *b += x * y;
-            *c += y * y;
-        }
     }
 
     /// `None` where the window has too little structure to be followed.
@@ -88,53 +82,70 @@ impl Window {
     /// Gradient times difference of the images, summed: the right side of the normal equations.
     pub(crate) fn descent(&self, image: &GreyImage, at: [f32; 2]) -> [f32; 2] {
         if let Some(samples) = Samples::of(image.size(), at) {
-            return descent_inside(self, image, samples);
+            return descent_inside(self, Pixels::of(image), samples);
         }
-        let mut sums = [0.0; 2];
-        for (p, at) in positions(at).enumerate() {
-            let difference = clamped(image, at) - self.image[p];
-            sums[0] -= self.gradients[0][p] * difference;
-            sums[1] -= self.gradients[1][p] * difference;
-        }
-        sums
+        let (patch, samples) = patch_at_border(image, at);
+        descent_inside(self, Pixels::of_patch(&patch), samples)
     }
 
     /// Mean absolute difference.
     pub(crate) fn difference(&self, image: &GreyImage, at: [f32; 2]) -> f32 {
-        let sum = match Samples::of(image.size(), at) {
-            Some(samples) => difference_inside(self, image, samples),
-            None => self.difference_at_border(image, at),
+        let sum = if let Some(samples) = Samples::of(image.size(), at) {
+            difference_inside(self, Pixels::of(image), samples)
+        } else {
+            let (patch, samples) = patch_at_border(image, at);
+            difference_inside(self, Pixels::of_patch(&patch), samples)
         };
         sum / N_PIXELS as f32
     }
+}
 
-    fn difference_at_border(&self, image: &GreyImage, at: [f32; 2]) -> f32 {
-        let mut sum = 0.0;
-        for (p, at) in positions(at).enumerate() {
-            sum += (clamped(image, at) - self.image[p]).abs();
+/// What a window reads: an image, or a copy of what is around a point.
+#[derive(Clone, Copy)]
+struct Pixels<'a> {
+    values: &'a [f32],
+    width: usize,
+}
+
+/// The pixels of a window, and one more to the right and below.
+type Patch = [f32; PATCH * PATCH];
+
+impl<'a> Pixels<'a> {
+    fn of(image: &'a GreyImage) -> Self {
+        Self {
+            values: &image.values,
+            width: image.width,
         }
-        sum
+    }
+
+    fn of_patch(patch: &'a Patch) -> Self {
+        Self {
+            values: patch,
+            width: PATCH,
+        }
     }
 }
 
-/// The pixels of the window around a point, row by row.
-fn positions([x, y]: [f32; 2]) -> impl Iterator<Item = [f32; 2]> {
-    let offset = |ix: usize| ix as f32 - HALF as f32;
-    (0..N_PIXELS).map(move |p| [x + offset(p % WINDOW), y + offset(p / WINDOW)])
-}
-
-/// Bilinear; outside, the border pixel goes on.
-fn clamped(image: &GreyImage, [x, y]: [f32; 2]) -> f32 {
-    let (right, bottom) = (image.width - 1, image.height - 1);
-    let (x, y) = (x.clamp(0.0, right as f32), y.clamp(0.0, bottom as f32));
-    let (column, row) = (x.trunc() as usize, y.trunc() as usize);
-    let (next_column, next_row) = ((column + 1).min(right), (row + 1).min(bottom));
-    let at = |row: usize, column: usize| image.values[row * image.width + column];
-    let [w00, w01, w10, w11] = weights(x.fract(), y.fract());
-    at(row, column) * w00
-        + at(row, next_column) * w01
-        + at(next_row, column) * w10
-        + at(next_row, next_column) * w11
+/// What is around a point near the border or outside, where the border pixels go on; and how a window reads it.
+fn patch_at_border(image: &GreyImage, [x, y]: [f32; 2]) -> (Patch, Samples) {
+    let indices = |at: f32, side: usize| -> [usize; PATCH] {
+        let first = (at.floor() as i64).saturating_sub(HALF as i64);
+        std::array::from_fn(|i| first.saturating_add(i as i64).clamp(0, side as i64 - 1) as usize)
+    };
+    let (columns, rows) = (indices(x, image.width), indices(y, image.height));
+    let mut patch = [0.0; PATCH * PATCH];
+    for (row, target) in rows.iter().zip(patch.chunks_exact_mut(PATCH)) {
+        let source = &image.values[row * image.width..][..image.width];
+        for (column, target) in columns.iter().zip(target) {
+            *target = source[*column];
+        }
+    }
+    let samples = Samples {
+        first_column: 0,
+        first_row: 0,
+        weights: weights(x - x.floor(), y - y.floor()),
+    };
+    (patch, samples)
 }
 
 /// Of the pixel, its right neighbour, the one below, and the one right of that.
@@ -168,7 +179,7 @@ impl Samples {
 
     /// The pixels that one row of the window is made of: in its upper and in its lower row.
     #[inline(always)]
-    fn rows<'a>(&self, image: &'a GreyImage, row: usize) -> [&'a [f32; WINDOW + 1]; 2] {
+    fn rows<'a>(&self, image: Pixels<'a>, row: usize) -> [&'a [f32; WINDOW + 1]; 2] {
         let of = |row: usize| {
             let start = (self.first_row + row) * image.width + self.first_column;
             image.values[start..]
@@ -229,15 +240,15 @@ macro_rules! with_or_without_fma {
     };
 }
 
-with_or_without_fma!(cut_inside(window: &mut Window, image: &GreyImage, gradients: &[GreyImage; 2], samples: Samples) -> () = cut);
-with_or_without_fma!(descent_inside(window: &Window, image: &GreyImage, samples: Samples) -> [f32; 2] = descent);
-with_or_without_fma!(difference_inside(window: &Window, image: &GreyImage, samples: Samples) -> f32 = difference);
+with_or_without_fma!(cut_inside(window: &mut Window, image: Pixels<'_>, gradients: [Pixels<'_>; 2], samples: Samples) -> () = cut);
+with_or_without_fma!(descent_inside(window: &Window, image: Pixels<'_>, samples: Samples) -> [f32; 2] = descent);
+with_or_without_fma!(difference_inside(window: &Window, image: Pixels<'_>, samples: Samples) -> f32 = difference);
 
 #[inline(always)]
 fn cut<const FMA: bool>(
     window: &mut Window,
-    image: &GreyImage,
-    gradients: &[GreyImage; 2],
+    image: Pixels<'_>,
+    gradients: [Pixels<'_>; 2],
     samples: Samples,
 ) {
     let weights = samples.weights;
@@ -245,7 +256,7 @@ fn cut<const FMA: bool>(
     let mut rest = [0.0_f32; 3];
     for row in 0..WINDOW {
         let pixels = samples.rows(image, row);
-        let [gx, gy] = gradients.each_ref().map(|g| samples.rows(g, row));
+        let [gx, gy] = gradients.map(|g| samples.rows(g, row));
         let start = row * WINDOW;
         for k in (0..LANE_COLUMNS).step_by(LANES) {
             let (x, y) = (eight::<FMA>(gx, weights, k), eight::<FMA>(gy, weights, k));
@@ -271,7 +282,7 @@ fn cut<const FMA: bool>(
 }
 
 #[inline(always)]
-fn descent<const FMA: bool>(window: &Window, image: &GreyImage, samples: Samples) -> [f32; 2] {
+fn descent<const FMA: bool>(window: &Window, image: Pixels<'_>, samples: Samples) -> [f32; 2] {
     let weights = samples.weights;
     let mut lanes = [[0.0_f32; LANES]; 2];
     let mut rest = [0.0_f32; 2];
@@ -298,7 +309,7 @@ fn descent<const FMA: bool>(window: &Window, image: &GreyImage, samples: Samples
 }
 
 #[inline(always)]
-fn difference<const FMA: bool>(window: &Window, image: &GreyImage, samples: Samples) -> f32 {
+fn difference<const FMA: bool>(window: &Window, image: Pixels<'_>, samples: Samples) -> f32 {
     let weights = samples.weights;
     let (mut lanes, mut rest) = ([0.0_f32; LANES], 0.0_f32);
     for row in 0..WINDOW {
@@ -343,8 +354,9 @@ mod tests {
         let (gradients, at) = (image.gradients(), [40.3, 30.7]);
         let samples = Samples::of(image.size(), at).unwrap();
         let [mut with, mut without] = [0, 1].map(|_| Window::cut(&image, &gradients, at));
-        cut::<true>(&mut with, &image, &gradients, samples);
-        cut::<false>(&mut without, &image, &gradients, samples);
+        let slopes = gradients.each_ref().map(Pixels::of);
+        cut::<true>(&mut with, Pixels::of(&image), slopes, samples);
+        cut::<false>(&mut without, Pixels::of(&image), slopes, samples);
         let is_near = |a: f32, b: f32| (a - b).abs() <= 1e-5 * with.tensor[0].abs();
         for i in 0..3 {
             assert!(
@@ -353,15 +365,59 @@ mod tests {
                 with.tensor
             );
         }
-        let plain = descent::<false>(&with, &other, samples);
-        for (a, b) in descent::<true>(&with, &other, samples)
+        let plain = descent::<false>(&with, Pixels::of(&other), samples);
+        for (a, b) in descent::<true>(&with, Pixels::of(&other), samples)
             .into_iter()
             .zip(plain)
         {
             assert!(is_near(a, b), "{a} {b}");
         }
-        // As if it lay at the border, pixel by pixel.
-        let difference = with.difference(&other, at) * N_PIXELS as f32;
-        assert!(difference > 1.0 && is_near(difference, with.difference_at_border(&other, at)));
+        assert!(with.difference(&other, at) * N_PIXELS as f32 > 1.0);
+    }
+
+    #[test]
+    fn a_copy_of_what_is_around_a_point_reads_as_the_image_and_its_border_goes_on() {
+        let image = GreyImage {
+            width: 40,
+            height: 30,
+            values: (0..40 * 30)
+                .map(|p| ((p * 7919) % 101) as f32 / 101.0)
+                .collect(),
+        };
+        let read = |pixels: Pixels<'_>, samples: Samples| -> Vec<f32> {
+            let rows = (0..WINDOW).map(|row| samples.rows(pixels, row));
+            let row = |rows| (0..WINDOW).map(move |k| one(rows, samples.weights, k));
+            rows.flat_map(row).collect()
+        };
+        let at = [19.3, 14.8];
+        let (patch, samples) = patch_at_border(&image, at);
+        let inside = Samples::of(image.size(), at).unwrap();
+        assert_eq!(
+            read(Pixels::of_patch(&patch), samples),
+            read(Pixels::of(&image), inside)
+        );
+        for at in [[2.25, 28.5], [-30.0, 3.0], [1e9, -1e9]] {
+            let (patch, samples) = patch_at_border(&image, at);
+            let found = read(Pixels::of_patch(&patch), samples);
+            for (p, found) in found.iter().enumerate() {
+                let offset = |ix: usize| ix as f32 - HALF as f32;
+                let x = (at[0] + offset(p % WINDOW)).clamp(0.0, 39.0);
+                let y = (at[1] + offset(p / WINDOW)).clamp(0.0, 29.0);
+                let value = |column: f32, row: f32| {
+                    let (column, row) = (column.min(39.0) as usize, row.min(29.0) as usize);
+                    image.values[row * 40 + column]
+                };
+                let (left, top) = (x.floor(), y.floor());
+                let above =
+                    value(left, top) * (1.0 - x.fract()) + value(left + 1.0, top) * x.fract();
+                let below = value(left, top + 1.0) * (1.0 - x.fract())
+                    + value(left + 1.0, top + 1.0) * x.fract();
+                let expected = above * (1.0 - y.fract()) + below * y.fract();
+                assert!(
+                    (found - expected).abs() < 1e-5,
+                    "{at:?} {p}: {found} {expected}"
+                );
+            }
+        }
     }
 }
