@@ -15,7 +15,7 @@ use splat_slam::track::refinement::FrameRef;
 use splat_slam::track::tracker::Tracker;
 use splat_types::frame::Frame;
 use splat_types::time::Stopwatch;
-use splat_types::tracking::{TrackState, TrackedFrame};
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::{Rigid, Similarity};
 
 /// Times that the figures of a run are made from: those of the last two hours at 15 Hz.
@@ -181,9 +181,15 @@ impl TrackStage {
         }
         self.say(&tracked);
         let moved = self.moved.take();
+        // Without a map, poses have no place and no unit that a robot could use.
+        let is_before_map = self.tracker.as_ref().is_some_and(Tracker::is_before_map);
         if self.is_received {
             self.events.push(LiveEvent::Frame(Box::new(PoseEvent {
-                tracked,
+                tracked: if is_before_map {
+                    without_pose(&tracked)
+                } else {
+                    tracked
+                },
                 odom_from_cam: frame.odometry,
                 base_from_cam: None,
                 moved,
@@ -292,6 +298,16 @@ impl TrackStage {
             _ => {}
         }
         self.said = tracked.state;
+    }
+}
+
+/// As long as there is no map.
+fn without_pose(tracked: &TrackedFrame) -> TrackedFrame {
+    TrackedFrame {
+        state: TrackState::Initialising,
+        reason: Some(LostReason::NoKeyframes),
+        pose: None,
+        ..*tracked
     }
 }
 

@@ -71,4 +71,5 @@ mod tracking;
 mod tracking_node;
 mod trajectory;
 mod type_hashes;
+mod visual_odometry;
 mod xfeat;

@@ -2,6 +2,10 @@
 
 pub mod select;
 
+pub mod working_camera;
+
+pub mod visual_odometry;
+
 pub mod track;
 
 pub mod mapper;

@@ -1,6 +1,7 @@
 //! What was said of every frame, and what is known of it in the end.
 
 use crate::track::anchor::Anchor;
+use crate::track::map_odometry::MapInitialisation;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
@@ -19,7 +20,7 @@ pub struct FrameTrack {
     pub n_inliers: u32,
     /// Standard deviation along and about the least certain axis: (the map's unit, degrees).
     pub std: Option<(f32, f32)>,
-    /// `world_from_cam` as it was measured when the frame came.
+    /// `world_from_cam` as it was measured when the frame came; what was reported before there was a map, in that map.
     pub live: Option<Rigid>,
     /// The same by the last poses of the keyframes, and of frames that had no pose when they came but have one since.
     pub refined: Option<Rigid>,
@@ -44,6 +45,8 @@ pub struct Tracks {
 pub(crate) struct HistoryEntry {
     track: FrameTrack,
     pub(crate) anchor: Option<Anchor>,
+    /// `live` is in the frame of this segment of odometry: there was no map.
+    pub(crate) segment: Option<u32>,
     /// The map was looked at to find where its image fits.
     pub(crate) is_fitted: bool,
 }
@@ -97,9 +100,28 @@ impl History {
         self.frames.push(HistoryEntry {
             track,
             anchor,
+            segment: None,
             is_fitted: false,
         });
         self.frames.len() - 1
+    }
+
+    /// The frame pushed last has its pose in the frame of a segment of odometry.
+    pub(crate) fn reported_in(&mut self, segment: u32) {
+        if let Some(entry) = self.frames.last_mut() {
+            entry.segment = Some(segment);
+        }
+    }
+
+    /// Poses that were reported before there was a map go into its frame, where it is known how.
+    pub(crate) fn express_in_map(&mut self, initialisation: &MapInitialisation) {
+        for entry in &mut self.frames {
+            if entry.segment.take() == Some(initialisation.segment) {
+                let map = initialisation.world_from_odometry;
+                let in_map = |pose: &Rigid| Some(map?.transform_pose(pose));
+                entry.track.live = entry.track.live.as_ref().and_then(in_map);
+            }
+        }
     }
 
     pub(crate) fn into_tracks(self, mut frames: Vec<FrameTrack>) -> Tracks {

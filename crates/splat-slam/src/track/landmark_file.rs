@@ -10,7 +10,8 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::track::landmarks::{Landmark, Landmarks, StoredKeyframe};
-use crate::track::observation::{Camera, Observation, THUMBNAIL_LEN};
+use crate::track::observation::{Observation, THUMBNAIL_LEN};
+use crate::working_camera::WorkingCamera;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
@@ -162,7 +163,7 @@ impl Keyframe {
             id: self.id,
             seen: Arc::new(seen),
             world_from_cam,
-            camera: Camera {
+            camera: WorkingCamera {
                 pinhole: self.pinhole.intrinsics()?,
                 lens,
             },

@@ -5,8 +5,9 @@ use std::sync::{Arc, Weak};
 
 use glam::{DVec2, DVec3};
 
-use crate::track::observation::{Camera, Observation, UndistortedObservation};
+use crate::track::observation::{Observation, UndistortedObservation};
 use crate::track::params::TrackParams;
+use crate::working_camera::WorkingCamera;
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
@@ -48,7 +49,7 @@ pub(crate) struct StoredKeyframe {
     pub(crate) id: u32,
     pub(crate) seen: Arc<Observation>,
     pub(crate) world_from_cam: Rigid,
-    pub(crate) camera: Camera,
+    pub(crate) camera: WorkingCamera,
     pub(crate) covariance: Option<Covariance>,
     pub(crate) landmarks: Vec<Landmark>,
     /// How often the present unit of its depths goes into that of its first ones.
@@ -138,7 +139,7 @@ impl StoredKeyframe {
         before: Option<Self>,
         params: &TrackParams,
     ) -> Option<Self> {
-        let camera = Camera::of(&view.intrinsics, view.lens.as_ref(), seen.working_px)?;
+        let camera = WorkingCamera::of(&view.intrinsics, view.lens.as_ref(), seen.working_px)?;
         let mut held = Self {
             id: view.keyframe.id,
             seen,

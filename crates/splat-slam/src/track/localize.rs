@@ -7,9 +7,12 @@ use nalgebra::{Matrix3, Matrix6, Vector3};
 use crate::track::landmarks::{Landmarks, StoredKeyframe};
 use crate::track::matching::{Pairs, guided, unguided};
 use crate::track::motion::Motion;
-use crate::track::observation::{Camera, Observation, UndistortedObservation};
+use crate::track::observation::{Observation, UndistortedObservation};
+use crate::track::odometry_link::LinkedPose;
 use crate::track::params::TrackParams;
 use crate::track::pose_fit::{self, Fit};
+use crate::working_camera::WorkingCamera;
+use splat_types::covariance::Covariance;
 use splat_types::tracking::LostReason;
 use splat_types::transform::{Rigid, skew};
 
@@ -64,6 +67,8 @@ struct Gates {
 /// What is known of the camera before a frame is looked at.
 pub(crate) struct Hint<'a> {
     pub(crate) motion: Option<&'a Motion>,
+    /// `cam_from_world` by odometry.
+    pub(crate) guess: Option<Rigid>,
     pub(crate) is_lost: bool,
     /// Frames without a measured pose since the last one with.
     pub(crate) n_failed: usize,
@@ -97,7 +102,8 @@ impl Localizer<'_> {
         let frame = (seen, &undistorted);
         let mut failure = LostReason::NotRecognised;
         let motion = hint.motion.filter(|_| !hint.is_lost);
-        if let Some(guess) = motion.map(|motion| motion.ahead(seen.stamp)) {
+        let ahead = motion.map(|motion| motion.ahead(seen.stamp));
+        if let Some(guess) = hint.guess.or(ahead) {
             for radius in [NARROW, WIDE] {
                 match self.around(&guess, radius, frame, &self.tracking_gates()) {
                     Ok(located) if self.is_plausible(seen, &located, hint) => {
@@ -107,8 +113,8 @@ impl Localizer<'_> {
                     Err(reason) => failure = reason,
                 }
             }
-            // One frame may be blurred; a search is for what lasts.
-            if hint.n_failed == 0 {
+            // One frame may be blurred, and odometry goes on by itself; a search is for what lasts.
+            if hint.n_failed == 0 || hint.guess.is_some() {
                 return (Err(failure), false);
             }
         }
@@ -206,7 +212,7 @@ impl Localizer<'_> {
 
     /// The camera of the newest keyframe that was taken by the same one, refined as it is; else what the source says. A
     /// frame without a calibration is one of the keyframes' camera if it has their size.
-    fn camera_of(&self, seen: &Observation) -> Option<Camera> {
+    fn camera_of(&self, seen: &Observation) -> Option<WorkingCamera> {
         let is_same = |held: &&StoredKeyframe| {
             let is_stated = held.seen.intrinsics == seen.intrinsics;
             held.seen.frame_px == seen.frame_px && (is_stated || seen.intrinsics.is_none())
@@ -214,7 +220,7 @@ impl Localizer<'_> {
         let newest = self.landmarks.held.values().rev().find(is_same);
         newest
             .map(|held| held.camera)
-            .or_else(|| Camera::of(&seen.intrinsics?, None, seen.working_px))
+            .or_else(|| WorkingCamera::of(&seen.intrinsics?, None, seen.working_px))
     }
 
     /// The pose near a guess, measured twice: the second time by landmarks that are looked for where the first put them.
@@ -318,12 +324,14 @@ impl Localizer<'_> {
         let away = Vector3::new(away.x, away.y, away.z);
         let mut place = covariance.fixed_view_mut::<3, 3>(0, 0);
         place += away * away.transpose();
-        if let Some(of_key) = &held.covariance {
-            let of_key = Matrix6::from_fn(|i, j| of_key[i][j]);
-            let carry = adjoint(&cam_from_key);
-            covariance += carry * of_key * carry.transpose();
-        }
-        covariance
+        covariance + carried(held.covariance.as_ref(), &cam_from_key)
+    }
+
+    /// What the keyframe's own covariance is worth at a camera that odometry has led away from it.
+    pub(crate) fn covariance_of_key(&self, linked: &LinkedPose) -> Matrix6<f64> {
+        let held = self.landmarks.held.get(&linked.keyframe_id);
+        let of_key = held.and_then(|held| held.covariance.as_ref());
+        carried(of_key, &linked.key_from_cam.inverse())
     }
 
     /// Keyframes that a search compares a frame with: the newest ones and the last one tracked by, the most alike, and
@@ -385,6 +393,16 @@ fn most_frequent(ids: impl Iterator<Item = u32>) -> u32 {
     }
     let most = counts.into_iter().max_by_key(|(id, n)| (*n, *id));
     most.map_or(0, |(id, _)| id)
+}
+
+/// A keyframe's covariance in the axes of a camera beside it; zero where it is not known.
+fn carried(of_key: Option<&Covariance>, cam_from_key: &Rigid) -> Matrix6<f64> {
+    let Some(of_key) = of_key else {
+        return Matrix6::zeros();
+    };
+    let of_key = Matrix6::from_fn(|i, j| of_key[i][j]);
+    let carry = adjoint(cam_from_key);
+    carry * of_key * carry.transpose()
 }
 
 /// Takes a small motion of the source in its own axes to that of the target, translation first.

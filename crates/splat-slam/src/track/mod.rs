@@ -16,6 +16,10 @@ mod landmark_file;
 
 mod anchor;
 
+pub mod odometry_link;
+
+mod map_odometry;
+
 pub mod refinement;
 
 pub mod history;

@@ -3,10 +3,11 @@
 use glam::DVec2;
 
 use crate::track::params::TrackParams;
+use crate::working_camera::WorkingCamera;
 use splat_geometry::features::descriptor::{Descriptors, working_image};
 use splat_geometry::features::orb;
 use splat_geometry::features::scale_space::Grey;
-use splat_types::camera::{CameraModel, Intrinsics};
+use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
 use splat_types::time::Stamp;
 
@@ -38,19 +39,10 @@ pub(crate) struct Observation {
     pub(crate) thumbnail: Vec<f32>,
 }
 
-/// The camera behind a working image.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Camera {
-    /// In pixels of about the working image's size.
-    pub(crate) pinhole: Intrinsics,
-    /// Where the image is no pinhole's: its lens, of the working image.
-    pub(crate) lens: Option<CameraModel>,
-}
-
 /// Corners where the pinhole would show them, by cells.
 #[derive(Debug)]
 pub(crate) struct UndistortedObservation {
-    pub(crate) camera: Camera,
+    pub(crate) camera: WorkingCamera,
     /// In the order of `Observation::pixels`; not a number where the lens says nothing.
     pub(crate) pixels: Vec<DVec2>,
     columns: usize,
@@ -91,35 +83,8 @@ impl Observation {
     }
 }
 
-impl Camera {
-    /// Of working images of `working_px`, from a camera whose images may have another size. `None` for cameras
-    /// that are none.
-    pub(crate) fn of(
-        intrinsics: &Intrinsics,
-        lens: Option<&CameraModel>,
-        (width, height): (u32, u32),
-    ) -> Option<Self> {
-        if !intrinsics.is_plausible() || width == 0 || height == 0 {
-            return None;
-        }
-        Some(Self {
-            pinhole: intrinsics.resized(width, height),
-            lens: lens.map(|lens| lens.resized(width, height)),
-        })
-    }
-
-    fn undistorted(&self, pixel: DVec2) -> DVec2 {
-        let Some(lens) = &self.lens else {
-            return pixel;
-        };
-        let ray = lens.ray_in_cam(pixel);
-        let undistorted = ray.and_then(|ray| self.pinhole.project(ray));
-        undistorted.unwrap_or(DVec2::NAN)
-    }
-}
-
 impl UndistortedObservation {
-    pub(crate) fn of(seen: &Observation, camera: Camera) -> Self {
+    pub(crate) fn of(seen: &Observation, camera: WorkingCamera) -> Self {
         let pixels: Vec<DVec2> = seen.pixels.iter().map(|p| camera.undistorted(*p)).collect();
         let n_cells = |side: u32| (f64::from(side) / CELL_PX).ceil().max(1.0) as usize;
         let columns = n_cells(camera.pinhole.width_px);

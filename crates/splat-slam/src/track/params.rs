@@ -21,6 +21,8 @@ pub enum Photometric {
 pub struct TrackParams {
     /// A pose for every frame, by the landmarks of the newest keyframes.
     pub enabled: bool,
+    /// Corners are followed from frame to frame, which gives poses before there is a map and ahead of its newest keyframe.
+    pub odometry: bool,
     /// Longer side of the image that frames are tracked on.
     #[schemars(range(min = 64, max = 1024), extend("unit" = "px"))]
     pub max_side: u32,
@@ -60,6 +62,7 @@ impl Default for TrackParams {
     fn default() -> Self {
         Self {
             enabled: true,
+            odometry: true,
             max_side: 320,
             max_features: 600,
             max_landmarks: 500,

@@ -3,6 +3,8 @@
 //! Corners of the frame are paired with landmarks of keyframes, near where the motion so far predicts them, or by their
 //! bits alone where there is no motion to go by. Reads copies of what the map knows; reports the map nothing.
 
+mod reported;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -13,14 +15,16 @@ use crate::track::history::{FrameTrack, History, Tracks};
 use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
 use crate::track::landmarks::{KeyframeView, Landmarks};
 use crate::track::localize::{Hint, Localized, Localizer};
+use crate::track::map_odometry::MapOdometry;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
+use crate::track::odometry_link::LinkedPose;
 use crate::track::params::TrackParams;
 use crate::track::refinement::FrameRef;
 use splat_types::covariance::Covariance;
 use splat_types::frame::Frame;
 use splat_types::time::Stamp;
-use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
 
 /// Design effect before one was seen, and the share that each frame has in the mean: some 50 frames.
@@ -38,6 +42,15 @@ struct Waiting {
     history_ix: usize,
 }
 
+/// How the search for a frame that the motion does not lead to stands.
+#[derive(Debug, Default)]
+struct Search {
+    /// Frames without a measured pose since the last one with.
+    n_failed: usize,
+    /// Keyframe from which it goes on.
+    next: usize,
+}
+
 #[derive(Debug)]
 pub struct Tracker {
     params: TrackParams,
@@ -48,13 +61,11 @@ pub struct Tracker {
     motion: Option<Motion>,
     /// Of the last measured pose.
     anchor: Option<Anchor>,
-    /// Frames without a measured pose since the last one with.
-    n_failed: usize,
+    odometry: MapOdometry,
+    search: Search,
     /// Of the frame before.
     last_stamp: Option<Stamp>,
     design: f64,
-    /// Where among the keyframes the search goes on.
-    searched: usize,
     /// Frames that get a second look when the map has reached them.
     waiting: VecDeque<Waiting>,
     history: History,
@@ -69,10 +80,10 @@ impl Tracker {
             state: TrackState::Initialising,
             motion: None,
             anchor: None,
-            n_failed: 0,
+            odometry: MapOdometry::new(params.odometry),
+            search: Search::default(),
             last_stamp: None,
             design: FIRST_DESIGN,
-            searched: 0,
             waiting: VecDeque::new(),
             history: History::default(),
         }
@@ -86,6 +97,7 @@ impl Tracker {
             tracker.keyframes.insert(held.id, pose);
             tracker.landmarks.held.insert(held.id, held);
         }
+        tracker.odometry = MapOdometry::new(params.odometry).in_map();
         Ok(tracker)
     }
 
@@ -112,20 +124,47 @@ impl Tracker {
 
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
+        let odometry = self.odometry.follow(frame);
         let seen = Arc::new(Observation::of(frame, &self.params));
-        let located = self.find(&seen);
-        let tracked = match located {
-            Ok((located, by_search)) => self.found(&seen, &located, by_search),
-            Err(reason) => self.missed(&seen, reason),
+        let linked = self.linked(seen.seq);
+        let guess = linked.as_ref().map(|(_, pose)| pose.inverse());
+        let tracked = match (self.find(&seen, guess), linked) {
+            (Ok((located, by_search)), linked) => match linked {
+                Some((linked, pose)) if self.is_surer(&linked, &located) => {
+                    self.carried(&seen, &linked, &pose)
+                }
+                _ => self.found(&seen, &located, by_search),
+            },
+            (Err(_), Some((linked, pose))) => self.carried(&seen, &linked, &pose),
+            (Err(reason), None) => {
+                match odometry.filter(|pose| self.odometry.is_before_map(pose)) {
+                    Some(pose) => return self.ahead_of_map(seen, &pose),
+                    None => self.missed(&seen, reason),
+                }
+            }
         };
+        self.keep(seen, &tracked, None);
+        tracked
+    }
+
+    /// Keeps a frame for a second look. `segment`: of odometry, where the pose is in its frame.
+    fn keep(&mut self, seen: Arc<Observation>, tracked: &TrackedFrame, segment: Option<u32>) {
         self.last_stamp = Some(seen.stamp);
         let anchor = self.anchor.filter(|_| tracked.is_measured());
-        let history_ix = self.history.push(&tracked, anchor);
+        let history_ix = self.history.push(tracked, anchor);
+        if let Some(segment) = segment {
+            self.history.reported_in(segment);
+        }
         self.waiting.push_back(Waiting { seen, history_ix });
         if self.waiting.len() > self.params.max_deferred_frames {
             self.waiting.pop_front();
         }
-        tracked
+    }
+
+    /// Whether the pose of the last frame is in odometry's frame and unit, as there is no map yet.
+    pub fn is_before_map(&self) -> bool {
+        let last = self.history.frames.last();
+        last.is_some_and(|entry| entry.segment.is_some())
     }
 
     /// Takes over what the map says: all of its keyframes, with their poses of this moment.
@@ -145,6 +184,9 @@ impl Tracker {
                 (id, (view.world_from_cam, unit.unwrap_or(1.0)))
             })
             .collect();
+        if let Some(initialisation) = self.odometry.update(views) {
+            self.history.express_in_map(&initialisation);
+        }
         let after = self.anchor.and_then(|anchor| self.pose_by(&anchor));
         let unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
         match (before.zip(after), self.motion.as_mut()) {
@@ -231,78 +273,18 @@ impl Tracker {
         }
     }
 
-    fn found(&mut self, seen: &Observation, located: &Localized, by_search: bool) -> TrackedFrame {
-        let design = located.design.clamp(0.0, MAX_DESIGN);
-        self.design += DESIGN_SHARE * (design - self.design);
-        let covariance = self.localizer().covariance(located);
-        let cam_from_world = located.cam_from_world;
-        let has_jumped = by_search
-            && self.motion.as_ref().is_some_and(|motion| {
-                self.state == TrackState::Lost
-                    || motion.is_elsewhere(seen.stamp, &cam_from_world, self.scene_depth())
-            });
-        // A jump that was noticed at once was a loss all the same.
-        if has_jumped && self.state != TrackState::Lost {
-            self.history.n_lost += 1;
-        }
-        let is_new = self.motion.is_none() && self.state == TrackState::Lost;
-        self.state = if has_jumped || is_new {
-            self.history.n_relocalised += 1;
-            TrackState::Relocalised
-        } else {
-            TrackState::Tracking
-        };
-        let before = self.motion.take().filter(|_| !has_jumped);
-        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
-        self.motion = Some(motion);
-        self.anchor = Some(self.anchor_of(located));
-        self.n_failed = 0;
-        TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
-            state: self.state,
-            reason: None,
-            pose: Some(TrackedPose {
-                world_from_cam: cam_from_world.inverse(),
-                covariance: rows(&covariance),
-                is_predicted: false,
-            }),
-            n_inliers: located.n_inliers,
-        }
+    /// A frame where odometry says, among the keyframes as they stand now.
+    fn linked(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
+        let linked = self.odometry.locate(seq)?;
+        let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
+        Some((linked, *world_from_key * linked.key_from_cam))
     }
 
-    fn missed(&mut self, seen: &Observation, reason: LostReason) -> TrackedFrame {
-        self.n_failed += 1;
-        let since = self
-            .motion
-            .as_ref()
-            .map(|motion| seen.stamp.secs_since(motion.stamp));
-        let last = self.last_stamp.unwrap_or(seen.stamp);
-        let wait = seen.stamp.secs_since(last) * LOOK_AHEAD;
-        // A keyframe that is gone leaves no motion, but a tracker that was somewhere.
-        let is_late = since.is_none_or(|secs| secs + wait >= self.params.lost_secs);
-        if self.state != TrackState::Initialising && self.state != TrackState::Lost {
-            self.state = if is_late {
-                TrackState::Lost
-            } else {
-                TrackState::Tracking
-            };
-            self.history.n_lost += u64::from(is_late);
-        }
-        let depth = self.scene_depth();
-        let pose = self.motion.as_ref().map(|motion| TrackedPose {
-            world_from_cam: motion.ahead(seen.stamp).inverse(),
-            covariance: rows(&motion.covariance_ahead(seen.stamp, depth)),
-            is_predicted: true,
-        });
-        TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
-            state: self.state,
-            reason: Some(reason),
-            pose,
-            n_inliers: 0,
-        }
+    /// Whether odometry knows better than the landmarks where the camera is.
+    fn is_surer(&self, linked: &LinkedPose, located: &Localized) -> bool {
+        let place = |covariance: &Matrix6<f64>| (0..3).map(|i| covariance[(i, i)]).sum::<f64>();
+        let by_odometry = linked.covariance + self.localizer().covariance_of_key(linked);
+        place(&by_odometry) < place(&self.localizer().covariance(located))
     }
 
     fn retry_frame(&mut self, waiting: &Waiting) {
@@ -338,18 +320,24 @@ impl Tracker {
     }
 
     /// The pose of the newest frame, and whether it was searched for without a hint.
-    fn find(&mut self, seen: &Observation) -> Result<(Localized, bool), LostReason> {
-        let (n, start) = (self.landmarks.held.len().max(1), self.searched);
+    /// `guess` is `cam_from_world` by odometry.
+    fn find(
+        &mut self,
+        seen: &Observation,
+        guess: Option<Rigid>,
+    ) -> Result<(Localized, bool), LostReason> {
+        let (n, start) = (self.landmarks.held.len().max(1), self.search.next);
         let hint = Hint {
             motion: self.motion.as_ref(),
+            guess,
             is_lost: self.state == TrackState::Lost,
-            n_failed: self.n_failed,
+            n_failed: self.search.n_failed,
             scene_depth: self.scene_depth(),
             last_keyframe: self.anchor.map(|anchor| anchor.keyframe_id),
         };
         let (found, has_searched) = self.localizer().find(seen, &hint, start);
         if has_searched {
-            self.searched = (start + self.params.relocalise_keyframes) % n;
+            self.search.next = (start + self.params.relocalise_keyframes) % n;
         }
         found
     }

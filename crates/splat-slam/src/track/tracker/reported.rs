@@ -1,0 +1,155 @@
+//! What was found of a frame -> what is reported of it, and the state that the tracker is in from then on.
+
+use std::sync::Arc;
+
+use super::{DESIGN_SHARE, LOOK_AHEAD, MAX_DESIGN, Tracker, rows};
+use crate::track::localize::Localized;
+use crate::track::motion::Motion;
+use crate::track::observation::Observation;
+use crate::track::odometry_link::LinkedPose;
+use crate::visual_odometry::odometry::OdometryPose;
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
+use splat_types::transform::Rigid;
+
+impl Tracker {
+    pub(super) fn found(
+        &mut self,
+        seen: &Observation,
+        located: &Localized,
+        by_search: bool,
+    ) -> TrackedFrame {
+        let design = located.design.clamp(0.0, MAX_DESIGN);
+        self.design += DESIGN_SHARE * (design - self.design);
+        let covariance = self.localizer().covariance(located);
+        let cam_from_world = located.cam_from_world;
+        let has_jumped = by_search
+            && self.motion.as_ref().is_some_and(|motion| {
+                self.state == TrackState::Lost
+                    || motion.is_elsewhere(seen.stamp, &cam_from_world, self.scene_depth())
+            });
+        // A jump that was noticed at once was a loss all the same.
+        if has_jumped && self.state != TrackState::Lost {
+            self.history.n_lost += 1;
+        }
+        let was_elsewhere = self.odometry.registered_in_map();
+        let is_new = was_elsewhere || self.motion.is_none() && self.state == TrackState::Lost;
+        self.state = if has_jumped || is_new {
+            self.history.n_relocalised += 1;
+            TrackState::Relocalised
+        } else {
+            TrackState::Tracking
+        };
+        let before = self.motion.take().filter(|_| !has_jumped);
+        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
+        self.motion = Some(motion);
+        self.anchor = Some(self.anchor_of(located));
+        self.search.n_failed = 0;
+        TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: None,
+            pose: Some(TrackedPose {
+                world_from_cam: cam_from_world.inverse(),
+                covariance: rows(&covariance),
+                is_predicted: false,
+            }),
+            n_inliers: located.n_inliers,
+        }
+    }
+
+    /// There is no map yet: the pose is in odometry's frame and unit.
+    pub(super) fn ahead_of_map(
+        &mut self,
+        seen: Arc<Observation>,
+        pose: &OdometryPose,
+    ) -> TrackedFrame {
+        (self.state, self.search.n_failed) = (TrackState::Tracking, 0);
+        let reported = TrackedPose {
+            world_from_cam: pose.odometry_from_cam,
+            covariance: pose.covariance,
+            is_predicted: false,
+        };
+        let tracked = TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: None,
+            pose: Some(reported),
+            n_inliers: pose.n_inliers,
+        };
+        self.keep(seen, &tracked, Some(pose.segment));
+        tracked
+    }
+
+    /// No landmarks of the map were found, and odometry has gone on from a keyframe.
+    pub(super) fn carried(
+        &mut self,
+        seen: &Observation,
+        linked: &LinkedPose,
+        world_from_cam: &Rigid,
+    ) -> TrackedFrame {
+        self.odometry.registered_in_map();
+        let is_new = self.state == TrackState::Lost;
+        self.state = if is_new {
+            self.history.n_relocalised += 1;
+            TrackState::Relocalised
+        } else {
+            TrackState::Tracking
+        };
+        let covariance = linked.covariance + self.localizer().covariance_of_key(linked);
+        let before = self.motion.take().filter(|_| !is_new);
+        let cam_from_world = world_from_cam.inverse();
+        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
+        self.motion = Some(motion);
+        let unit = self.keyframes.get(&linked.keyframe_id);
+        self.anchor = Some(linked.anchor(unit.map_or(1.0, |(_, unit)| *unit)));
+        self.search.n_failed = 0;
+        TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: None,
+            pose: Some(TrackedPose {
+                world_from_cam: *world_from_cam,
+                covariance: rows(&covariance),
+                is_predicted: false,
+            }),
+            n_inliers: linked.n_inliers,
+        }
+    }
+
+    pub(super) fn missed(&mut self, seen: &Observation, reason: LostReason) -> TrackedFrame {
+        self.search.n_failed += 1;
+        let since = self
+            .motion
+            .as_ref()
+            .map(|motion| seen.stamp.secs_since(motion.stamp));
+        let last = self.last_stamp.unwrap_or(seen.stamp);
+        let wait = seen.stamp.secs_since(last) * LOOK_AHEAD;
+        // A keyframe that is gone leaves no motion, but a tracker that was somewhere.
+        let is_late = since.is_none_or(|secs| secs + wait >= self.params.lost_secs);
+        if self.state != TrackState::Initialising && self.state != TrackState::Lost {
+            self.state = if is_late {
+                TrackState::Lost
+            } else {
+                TrackState::Tracking
+            };
+            self.history.n_lost += u64::from(is_late);
+        }
+        let depth = self.scene_depth();
+        let pose = self.motion.as_ref().map(|motion| TrackedPose {
+            world_from_cam: motion.ahead(seen.stamp).inverse(),
+            covariance: rows(&motion.covariance_ahead(seen.stamp, depth)),
+            is_predicted: true,
+        });
+        TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: Some(reason),
+            pose,
+            n_inliers: 0,
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Visual odometry alone, without a map, on synthetic scenes: how soon it begins, how far it strays, and what it says when
+//! it cannot know.
+
+use std::collections::BTreeMap;
+
+use splat_geometry::similarity;
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_slam::visual_odometry::odometry::{OdometryFrame, OdometryState, VisualOdometry};
+use splat_slam::working_camera::WorkingCamera;
+use splat_types::frame::Frame;
+use splat_types::transform::{Rigid, extent};
+
+fn frames(scene: &str) -> Vec<Frame> {
+    let params = Settings::shipped().params().unwrap();
+    let mut source = open_source::open(scene, &params.source, 0).unwrap();
+    std::iter::from_fn(|| source.next()).collect()
+}
+
+fn odometry_of(frames: &[Frame]) -> Vec<OdometryFrame> {
+    let mut odometry = VisualOdometry::default();
+    let found = frames.iter().map(|frame| {
+        let camera = frame.intrinsics.as_ref();
+        let camera = camera.and_then(|i| WorkingCamera::of(i, None, (i.width_px, i.height_px)));
+        odometry.push(frame, camera.as_ref())
+    });
+    found.collect()
+}
+
+/// RMSE after the best similarity, as a share of the true path's extent, by segment.
+fn errors(frames: &[Frame], found: &[OdometryFrame]) -> BTreeMap<u32, (usize, f64)> {
+    let mut segments: BTreeMap<u32, Vec<(Rigid, Rigid)>> = BTreeMap::new();
+    for (frame, found) in frames.iter().zip(found) {
+        if let Some(pose) = found.pose {
+            let pair = (frame.truth.unwrap(), pose.odometry_from_cam);
+            segments.entry(pose.segment).or_default().push(pair);
+        }
+    }
+    let error = |pairs: &Vec<(Rigid, Rigid)>| {
+        let points = pairs.iter().map(|(t, o)| (t.translation, o.translation));
+        let points: Vec<_> = points.collect();
+        let Some(fit) = similarity::of_points(&points) else {
+            return (pairs.len(), f64::INFINITY);
+        };
+        let squares = points
+            .iter()
+            .map(|(t, o)| fit.transform_point(*o).distance_squared(*t));
+        let rmse = (squares.sum::<f64>() / points.len() as f64).sqrt();
+        let way: Vec<_> = points.iter().map(|(t, _)| *t).collect();
+        (pairs.len(), rmse / extent(&way))
+    };
+    let errors = segments.iter().map(|(id, pairs)| (*id, error(pairs)));
+    errors.collect()
+}
+
+#[test]
+fn a_walk_through_a_room_is_followed_from_the_first_parallax_on() {
+    let frames = frames("synthetic:room?frames=90&width=320&height=240");
+    let found = odometry_of(&frames);
+    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
+    assert!(first <= 15, "begins with frame {first}");
+    let n_posed = found.iter().filter(|f| f.pose.is_some()).count();
+    assert!(
+        100 * n_posed >= 95 * (frames.len() - first),
+        "{n_posed} poses"
+    );
+    let errors = errors(&frames, &found);
+    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
+    let (_, error) = errors.values().next().unwrap();
+    assert!(*error < 0.02, "{:.2} % of the path's extent", 100.0 * error);
+    for found in found.iter().filter_map(|f| f.pose) {
+        assert!((0..6).all(|i| found.covariance[i][i] > 0.0));
+    }
+    assert_eq!(
+        odometry_of(&frames),
+        found,
+        "the same frames, the same poses"
+    );
+}
+
+#[test]
+fn after_a_jump_another_segment_begins() {
+    let all = frames("synthetic:room?frames=120&width=320&height=240");
+    // The camera is lifted from one place of its way to another.
+    let frames: Vec<Frame> = all[..40].iter().chain(&all[80..]).cloned().collect();
+    let found = odometry_of(&frames);
+    let errors = errors(&frames, &found);
+    assert!(errors.len() >= 2, "{errors:?}");
+    for (segment, (n, error)) in &errors {
+        let is_short = *n < 10;
+        assert!(
+            is_short || *error < 0.03,
+            "segment {segment}: {n} frames, {error}"
+        );
+    }
+    let last = found.last().unwrap();
+    assert_eq!(last.state, OdometryState::Tracking, "it is tracked again");
+}
+
+#[test]
+fn a_standing_camera_and_a_blank_wall_have_no_pose_and_the_reason() {
+    let frames = frames("synthetic:room?frames=8&width=320&height=240");
+    let still: Vec<Frame> = std::iter::repeat_n(frames[0].clone(), 8).collect();
+    let found = odometry_of(&still);
+    assert!(found.iter().all(|f| f.pose.is_none()));
+    assert_eq!(found[7].state, OdometryState::NoParallax);
+
+    let mut blank = frames[0].clone();
+    let mut image = (*blank.image).clone();
+    image.pixels.fill(90);
+    blank.image = image.into();
+    let found = odometry_of(&[blank.clone(), blank.clone()]);
+    assert_eq!(found[1].state, OdometryState::Blank);
+
+    let mut uncalibrated = frames[0].clone();
+    uncalibrated.intrinsics = None;
+    let found = odometry_of(&[uncalibrated]);
+    assert_eq!(found[0].state, OdometryState::NoCamera);
+}
