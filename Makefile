@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint zenoh-test v4l2-test record-kill-test bench ablation soak onnx-test ros2-test setup
+.PHONY: demo test lint zenoh-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -32,6 +32,11 @@ v4l2-test:
 # Kills a recording 50 times and reads back what is left, with our reader and with PyPI's mcap.
 record-kill-test:
 	scripts/record_kill_test
+
+# The live node beside the replay of the same recordings; NAMES="kitchen7s demo" for some of them.
+live-bench:
+	cargo build --release --locked
+	scripts/live_bench $(NAMES)
 
 # Figures for docs/BENCHMARKS.md: every stage and the whole step, sizes in the names.
 bench:
