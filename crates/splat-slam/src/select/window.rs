@@ -372,7 +372,24 @@ mod tests {
         {
             assert!(is_near(a, b), "{a} {b}");
         }
-        assert!(with.difference(&other, at) * N_PIXELS as f32 > 1.0);
+        // Pixel by pixel, inside and where the border goes on.
+        for at in [at, [2.25, 55.5]] {
+            let window = Window::cut(&image, &gradients, at);
+            let (patch, samples) = patch_at_border(&other, at);
+            let (mut sum, mut slope) = (0.0, [0.0; 2]);
+            for p in 0..N_PIXELS {
+                let rows = samples.rows(Pixels::of_patch(&patch), p / WINDOW);
+                let difference = one(rows, samples.weights, p % WINDOW) - window.image[p];
+                sum += difference.abs();
+                slope[0] -= window.gradients[0][p] * difference;
+                slope[1] -= window.gradients[1][p] * difference;
+            }
+            let difference = window.difference(&other, at) * N_PIXELS as f32;
+            assert!(difference > 1.0 && is_near(difference, sum));
+            for (a, b) in window.descent(&other, at).into_iter().zip(slope) {
+                assert!(is_near(a, b), "{a} {b}");
+            }
+        }
     }
 
     #[test]

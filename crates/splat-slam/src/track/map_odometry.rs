@@ -84,17 +84,14 @@ impl MapOdometry {
     }
 
     /// Whether a pose is to be reported in odometry's frame, as there is no map: the first segment's.
-    pub(crate) fn is_before_map(&mut self, pose: &OdometryPose) -> bool {
-        if self.before_map == BeforeMap::Waiting {
-            self.before_map = BeforeMap::Reported {
-                segment: pose.segment,
-                goes_on: true,
-            };
-        }
+    pub(crate) fn reports_before_map(&mut self, pose: &OdometryPose) -> bool {
         let of_segment = BeforeMap::Reported {
             segment: pose.segment,
             goes_on: true,
         };
+        if self.before_map == BeforeMap::Waiting {
+            self.before_map = of_segment;
+        }
         self.before_map == of_segment
     }
 
@@ -120,6 +117,9 @@ impl MapOdometry {
         let newest = self.link.update(linked);
         if let Some(view) = views.last() {
             self.camera = FrameCamera::of(view);
+            if self.before_map == BeforeMap::Waiting {
+                self.before_map = BeforeMap::Initialised;
+            }
         }
         let BeforeMap::Reported { segment, .. } = self.before_map else {
             return None;

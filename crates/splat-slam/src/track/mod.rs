@@ -16,7 +16,7 @@ mod landmark_file;
 
 mod anchor;
 
-pub mod odometry_link;
+mod odometry_link;
 
 mod map_odometry;
 

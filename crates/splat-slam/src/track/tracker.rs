@@ -137,7 +137,7 @@ impl Tracker {
             },
             (Err(_), Some((linked, pose))) => self.carried(&seen, &linked, &pose),
             (Err(reason), None) => {
-                match odometry.filter(|pose| self.odometry.is_before_map(pose)) {
+                match odometry.filter(|pose| self.odometry.reports_before_map(pose)) {
                     Some(pose) => return self.ahead_of_map(seen, &pose),
                     None => self.missed(&seen, reason),
                 }
@@ -275,7 +275,8 @@ impl Tracker {
 
     /// A frame where odometry says, among the keyframes as they stand now.
     fn linked(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
-        let linked = self.odometry.locate(seq)?;
+        let mut linked = self.odometry.locate(seq)?;
+        linked.covariance += self.localizer().covariance_of_key(&linked);
         let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
         Some((linked, *world_from_key * linked.key_from_cam))
     }
@@ -283,8 +284,7 @@ impl Tracker {
     /// Whether odometry knows better than the landmarks where the camera is.
     fn is_surer(&self, linked: &LinkedPose, located: &Localized) -> bool {
         let place = |covariance: &Matrix6<f64>| (0..3).map(|i| covariance[(i, i)]).sum::<f64>();
-        let by_odometry = linked.covariance + self.localizer().covariance_of_key(linked);
-        place(&by_odometry) < place(&self.localizer().covariance(located))
+        place(&linked.covariance) < place(&self.localizer().covariance(located))
     }
 
     fn retry_frame(&mut self, waiting: &Waiting) {

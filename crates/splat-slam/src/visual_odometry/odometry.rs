@@ -179,10 +179,7 @@ impl VisualOdometry {
         stamp: Stamp,
         camera: &WorkingCamera,
     ) -> Result<OdometryPose, OdometryState> {
-        let pixel = |p: [f32; 2]| camera.undistorted(DVec2::from(p.map(f64::from)));
-        let tracks = &self.tracks.tracks;
-        let seen = tracks.iter().map(|track| (track.id, pixel(track.pixel)));
-        let seen: Vec<(u32, DVec2)> = seen.filter(|(_, at)| at.is_finite()).collect();
+        let seen: Vec<(u32, DVec2)> = self.seen(camera).collect();
         match &mut self.stage {
             Stage::Starting { first } => {
                 let both = |(id, at): &(u32, DVec2)| Some((*id, *first.get(id)?, *at));
@@ -208,12 +205,18 @@ impl VisualOdometry {
         }
     }
 
+    /// Corners of the newest image: (number, where a pinhole shows it).
+    fn seen(&self, camera: &WorkingCamera) -> impl Iterator<Item = (u32, DVec2)> {
+        let pixel = |p: [f32; 2]| camera.undistorted(DVec2::from(p.map(f64::from)));
+        let tracks = self.tracks.tracks.iter();
+        let seen = tracks.map(move |track| (track.id, pixel(track.pixel)));
+        seen.filter(|(_, at)| at.is_finite())
+    }
+
     /// The newest image is the first of a segment that is to begin.
     fn begin(&mut self, camera: &WorkingCamera) -> OdometryState {
         self.tracks.refill();
-        let pixel = |p: [f32; 2]| camera.undistorted(DVec2::from(p.map(f64::from)));
-        let tracks = self.tracks.tracks.iter();
-        let first: BTreeMap<u32, DVec2> = tracks.map(|t| (t.id, pixel(t.pixel))).collect();
+        let first: BTreeMap<u32, DVec2> = self.seen(camera).collect();
         let is_blank = first.is_empty();
         self.stage = Stage::Starting { first };
         if is_blank {
@@ -289,13 +292,5 @@ impl VisualOdometry {
         self.stage = Stage::Starting {
             first: BTreeMap::new(),
         };
-    }
-
-    /// Median distance of the points in view, in odometry's unit; `None` without a segment.
-    pub fn median_depth(&self) -> Option<f64> {
-        match &self.stage {
-            Stage::Running(running) => Some(running.map.median_depth()),
-            Stage::Starting { .. } => None,
-        }
     }
 }

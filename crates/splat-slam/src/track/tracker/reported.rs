@@ -2,7 +2,10 @@
 
 use std::sync::Arc;
 
+use nalgebra::Matrix6;
+
 use super::{DESIGN_SHARE, LOOK_AHEAD, MAX_DESIGN, Tracker, rows};
+use crate::track::anchor::Anchor;
 use crate::track::localize::Localized;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
@@ -33,29 +36,9 @@ impl Tracker {
         }
         let was_elsewhere = self.odometry.registered_in_map();
         let is_new = was_elsewhere || self.motion.is_none() && self.state == TrackState::Lost;
-        self.state = if has_jumped || is_new {
-            self.history.n_relocalised += 1;
-            TrackState::Relocalised
-        } else {
-            TrackState::Tracking
-        };
-        let before = self.motion.take().filter(|_| !has_jumped);
-        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
-        self.motion = Some(motion);
-        self.anchor = Some(self.anchor_of(located));
-        self.search.n_failed = 0;
-        TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
-            state: self.state,
-            reason: None,
-            pose: Some(TrackedPose {
-                world_from_cam: cam_from_world.inverse(),
-                covariance: rows(&covariance),
-                is_predicted: false,
-            }),
-            n_inliers: located.n_inliers,
-        }
+        let anchor = self.anchor_of(located);
+        let pose = (cam_from_world, covariance, located.n_inliers);
+        self.measured(seen, pose, anchor, has_jumped || is_new)
     }
 
     /// There is no map yet: the pose is in odometry's frame and unit.
@@ -91,19 +74,35 @@ impl Tracker {
     ) -> TrackedFrame {
         self.odometry.registered_in_map();
         let is_new = self.state == TrackState::Lost;
+        let unit = self.keyframes.get(&linked.keyframe_id);
+        let anchor = linked.anchor(unit.map_or(1.0, |(_, unit)| *unit));
+        let pose = (
+            world_from_cam.inverse(),
+            linked.covariance,
+            linked.n_inliers,
+        );
+        self.measured(seen, pose, anchor, is_new)
+    }
+
+    /// A pose in the map: `cam_from_world`, its covariance and the observations that agree. `is_new`: it owes nothing to where
+    /// the camera was before.
+    fn measured(
+        &mut self,
+        seen: &Observation,
+        (cam_from_world, covariance, n_inliers): (Rigid, Matrix6<f64>, usize),
+        anchor: Anchor,
+        is_new: bool,
+    ) -> TrackedFrame {
         self.state = if is_new {
             self.history.n_relocalised += 1;
             TrackState::Relocalised
         } else {
             TrackState::Tracking
         };
-        let covariance = linked.covariance + self.localizer().covariance_of_key(linked);
         let before = self.motion.take().filter(|_| !is_new);
-        let cam_from_world = world_from_cam.inverse();
         let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
         self.motion = Some(motion);
-        let unit = self.keyframes.get(&linked.keyframe_id);
-        self.anchor = Some(linked.anchor(unit.map_or(1.0, |(_, unit)| *unit)));
+        self.anchor = Some(anchor);
         self.search.n_failed = 0;
         TrackedFrame {
             seq: seen.seq,
@@ -111,11 +110,11 @@ impl Tracker {
             state: self.state,
             reason: None,
             pose: Some(TrackedPose {
-                world_from_cam: *world_from_cam,
+                world_from_cam: cam_from_world.inverse(),
                 covariance: rows(&covariance),
                 is_predicted: false,
             }),
-            n_inliers: linked.n_inliers,
+            n_inliers,
         }
     }
 
