@@ -47,6 +47,11 @@ impl Backpressure {
         !state.is_sent || state.has_ended
     }
 
+    /// Poses of keyframes are on their way: steps of splats wait for them.
+    pub(crate) fn is_at_work(&self) -> bool {
+        !self.is_open()
+    }
+
     /// Selection is about to send a batch. `false`: geometry takes none any more.
     pub(crate) fn send(&self) -> bool {
         let mut state = self.lock();

@@ -1,16 +1,21 @@
 //! Batches -> geometry: the model as a stage, and the thread that it runs on live.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use crate::node::backpressure::Backpressure;
 use crate::node::threads::{Answer, Niceness, in_own_pool};
 use crate::params::params::Params;
 use splat_geometry::answer::GeometryBatch;
 use splat_geometry::error::GeometryError;
-use splat_geometry::model::GeometryModel;
-use splat_io::queue::{Receiver, Sender};
+use splat_geometry::model::{DepthTask, GeometryModel};
+use splat_geometry::mvs::depth_stream::{SweepJob, SweptDepth};
+use splat_io::queue::{Received, Receiver, Sender, WhenFull, queue};
 use splat_types::frame::Batch;
 use splat_types::time::Stopwatch;
+
+/// Live, while depth is worked on: time between looks at whether a batch has come.
+const DEPTH_TICK: Duration = Duration::from_millis(5);
 
 pub(crate) struct GeometryStage {
     model: Box<dyn GeometryModel>,
@@ -68,11 +73,27 @@ impl GeometryStage {
         }
     }
 
-    /// Depth of one more keyframe.
-    fn depth(&mut self) -> Option<GeometryBatch> {
+    /// Better poses of keyframes that came earlier.
+    fn refine(&mut self) -> Option<GeometryBatch> {
+        let watch = Stopwatch::start();
+        let refined = self.model.refine();
+        self.lock().secs += watch.secs();
+        refined
+    }
+
+    /// Depth of one more keyframe, or the work that it takes.
+    fn depth(&mut self) -> Option<DepthTask> {
         let watch = Stopwatch::start();
         let depth = self.model.depth();
         self.lock().secs += watch.secs();
+        depth
+    }
+
+    /// Depth that another thread has worked out in so many seconds.
+    fn take_depth(&mut self, (swept, secs): (SweptDepth, f64)) -> Option<GeometryBatch> {
+        let watch = Stopwatch::start();
+        let depth = self.model.take_depth(swept);
+        self.lock().secs += watch.secs() + secs;
         depth
     }
 
@@ -134,9 +155,9 @@ pub(crate) fn run_geometry(
     last_answer(stage, answers)
 }
 
-/// Poses of a batch before the depth of earlier ones.
+/// Poses of a batch as soon as it comes; depth of earlier keyframes is worked out beside it, by a thread of its own.
 fn run_live(
-    mut stage: GeometryStage,
+    stage: GeometryStage,
     batches: &Receiver<Arc<Batch>>,
     answers: &Sender<Answer>,
     backpressure: &Backpressure,
@@ -149,26 +170,61 @@ fn run_live(
         }
     }
     let _ending = Ending(backpressure);
+    let (jobs_tx, jobs) = queue("depth jobs", 1, WhenFull::Wait);
+    let (swept_tx, swept) = queue("depth", 1, WhenFull::Wait);
+    std::thread::scope(|scope| {
+        scope.spawn(move || in_own_pool("depth", Niceness::Depth, || run_depth(&jobs, &swept_tx)));
+        let depth = DepthWork {
+            jobs: jobs_tx,
+            swept,
+            is_at_work: false,
+        };
+        give_poses(stage, depth, batches, answers, backpressure)
+    })
+}
+
+/// The thread that works out depth, seen from the one of poses.
+struct DepthWork {
+    jobs: Sender<SweepJob>,
+    swept: Receiver<(SweptDepth, f64)>,
+    is_at_work: bool,
+}
+
+/// Ends when no more jobs come.
+fn run_depth(jobs: &Receiver<SweepJob>, swept: &Sender<(SweptDepth, f64)>) {
+    while let Some(job) = jobs.recv() {
+        let watch = Stopwatch::start();
+        let found = job.run();
+        if swept.send((found, watch.secs())).is_err() {
+            return;
+        }
+    }
+}
+
+fn give_poses(
+    mut stage: GeometryStage,
+    mut depth: DepthWork,
+    batches: &Receiver<Arc<Batch>>,
+    answers: &Sender<Answer>,
+    backpressure: &Backpressure,
+) -> Option<GeometryError> {
     let mut newest = None;
     loop {
-        let next = next_batch(&mut stage, batches);
-        let took_batch = matches!(next, Next::Batch(_));
-        let geometry = match next {
-            Next::Depth(depth) => depth,
+        let geometry = match next(&mut stage, &mut depth, batches) {
+            Next::Answer(geometry) => geometry,
             Next::Batch(batch) => {
                 let reported = stage.sooner(&batch);
                 newest = Some(batch);
+                backpressure.note(stage.has_registered);
+                backpressure.done();
                 match reported {
                     Ok(geometry) => geometry,
                     Err(error) => return Some(error),
                 }
             }
+            Next::Nothing => continue,
             Next::Ended => return last_answer(stage, answers),
         };
-        backpressure.note(stage.has_registered);
-        if took_batch {
-            backpressure.done();
-        }
         if answers.send((newest.clone(), geometry)).is_err() {
             return None;
         }
@@ -178,17 +234,41 @@ fn run_live(
 /// What geometry does next.
 enum Next {
     Batch(Arc<Batch>),
-    Depth(GeometryBatch),
+    /// Better poses, or depth, of keyframes that came earlier.
+    Answer(GeometryBatch),
+    /// Looks again.
+    Nothing,
     Ended,
 }
 
-/// A batch that has come, else depth that is outstanding, else whatever comes.
-fn next_batch(stage: &mut GeometryStage, batches: &Receiver<Arc<Batch>>) -> Next {
+/// A batch that has come, else poses that can be improved, else depth that has been worked out, else whatever comes.
+fn next(stage: &mut GeometryStage, depth: &mut DepthWork, batches: &Receiver<Arc<Batch>>) -> Next {
     if let Ok(Some(batch)) = batches.try_recv() {
         return Next::Batch(batch);
     }
-    let depth = stage.depth().map(Next::Depth);
-    depth.unwrap_or_else(|| batches.recv().map_or(Next::Ended, Next::Batch))
+    if let Some(refined) = stage.refine() {
+        return Next::Answer(refined);
+    }
+    if depth.is_at_work {
+        match depth.swept.recv_timeout(DEPTH_TICK) {
+            Received::Item(swept) => {
+                depth.is_at_work = false;
+                let found = stage.take_depth(swept);
+                return found.map_or(Next::Nothing, Next::Answer);
+            }
+            // Its thread has died: what it had in hand never comes back.
+            Received::Ended => return Next::Ended,
+            Received::Nothing => return Next::Nothing,
+        }
+    }
+    match stage.depth() {
+        Some(DepthTask::Known(known)) => Next::Answer(known),
+        Some(DepthTask::Sweep(job)) => {
+            depth.is_at_work = depth.jobs.send(*job).is_ok();
+            Next::Nothing
+        }
+        None => batches.recv().map_or(Next::Ended, Next::Batch),
+    }
 }
 
 fn last_answer(mut stage: GeometryStage, answers: &Sender<Answer>) -> Option<GeometryError> {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::node::autosave::Autosave;
+use crate::node::backpressure::Backpressure;
 use crate::node::job::{KeyframeLatency, Progress};
 use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
@@ -30,7 +31,9 @@ const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
 /// The same live, where a keyframe waits for them.
-const LIVE_STEPS_AT_ONCE: u64 = 2;
+const LIVE_STEPS_AT_ONCE: u64 = 1;
+/// Live: a step is made after so many seconds, even where poses have all processors busy: what is seen is to be shown.
+const MAX_SECS_WITHOUT_STEP: f64 = 0.2;
 /// Seconds that geometry gets to end after a stop.
 const SECS_AFTER_STOP: f64 = 0.7;
 /// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
@@ -53,6 +56,8 @@ pub(crate) struct MapStage {
     params: MapperParams,
     is_live: bool,
     n_frames: Option<u64>,
+    /// Live: the threads that make steps; `None`: those that all share.
+    pub(crate) step_pool: Option<rayon::ThreadPool>,
     pub(crate) request_handler: RequestHandler,
     /// Live: frames of the tracker to look at while there is nothing else to do.
     pub(crate) fitter: Option<RefinementWorker>,
@@ -60,6 +65,7 @@ pub(crate) struct MapStage {
     pub(crate) autosave: Option<Autosave>,
     pub(crate) recovery: Recovery,
     since_snapshot: Stopwatch,
+    since_step: Stopwatch,
     grace: ShutdownTimeout,
     pub(crate) figures: MapFigures,
 }
@@ -152,11 +158,13 @@ impl MapStage {
             request_handler: RequestHandler::new(calls.flatten(), &params.track, stop.clone()),
             grace: ShutdownTimeout::new(stop),
             n_frames,
+            step_pool: None,
             fitter: None,
             reports,
             autosave: None,
             recovery,
             since_snapshot: Stopwatch::start(),
+            since_step: Stopwatch::start(),
             figures: MapFigures::default(),
         }
     }
@@ -200,6 +208,11 @@ impl MapStage {
         }
     }
 
+    /// Live: whether splats wait, since poses of keyframes are at work; now and then a step is made all the same.
+    pub(crate) fn gives_way(&mut self, poses: &Backpressure) -> bool {
+        poses.is_at_work() && self.since_step.secs() < MAX_SECS_WITHOUT_STEP
+    }
+
     /// Live: a few steps, if any are left to make. Returns whether some were made.
     pub(crate) fn step_while_waiting(
         &mut self,
@@ -208,6 +221,7 @@ impl MapStage {
         if self.map.is_settled() {
             return false;
         }
+        self.since_step = Stopwatch::start();
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
         let target = (self.map.n_steps() + LIVE_STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
@@ -330,7 +344,11 @@ impl MapStage {
         while self.map.n_steps() < target && !self.recovery.stop.is_asked() {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
             let phase = phase(self.map.n_steps());
-            let made = self.map.step(n, phase);
+            let map = &mut self.map;
+            let made = match &self.step_pool {
+                Some(pool) => pool.install(|| map.step(n, phase)),
+                None => map.step(n, phase),
+            };
             // After a fault the count of steps says how many are left.
             if self.react(made) == Some(0) || self.recovery.error.is_some() {
                 break;

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use crate::node::backpressure::Backpressure;
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, SelectStage};
@@ -10,7 +11,7 @@ use crate::node::publish_threads::{
     LiveStage, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
 };
 use crate::node::source_thread::SourceStage;
-use crate::node::threads::{Answer, Niceness, in_own_pool, joined, run_select, run_source};
+use crate::node::threads::{Answer, Niceness, joined, own_pool, run_select, run_source};
 use crate::node::track_thread::{KeyframeUpdate, TrackStage, TrackingSummary, run_track};
 use crate::node::{open, refinement};
 use splat_geometry::error::GeometryError;
@@ -32,6 +33,8 @@ const INPUT_QUEUE: usize = 2;
 const EVENT_QUEUE: usize = 8;
 /// How long a call from outside may wait while the map has nothing to do.
 const CALL_TICK: Duration = Duration::from_millis(100);
+/// Live: time between looks of the map at whether poses of keyframes are still at work.
+const POSE_TICK: Duration = Duration::from_millis(4);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
 const UPDATE_SECS: f64 = 1.0;
 
@@ -239,7 +242,7 @@ impl Stages {
             run_source(self.source, &frames_tx, from_source.as_ref())
         })?;
         let backpressure = is_live.then(|| Arc::new(self.geometry.backpressure()));
-        let paced = backpressure.clone();
+        let (paced, poses) = (backpressure.clone(), backpressure.clone());
         let select = spawn("select", move || {
             let (received, backpressure) = (from_select.as_ref(), paced.as_deref());
             run_select(self.select, &frames, &batches_tx, received, backpressure)
@@ -255,13 +258,8 @@ impl Stages {
                 drop(snapshots_tx.send((snapshot, is_last)));
                 progress_tx.send(progress).ok();
             };
-            let updates = (is_live, updates_tx.as_ref());
-            let run = || run_map(self.map, updates, &answers, &mut publish);
-            if is_live {
-                in_own_pool("map", Niceness::Map, run)
-            } else {
-                run()
-            }
+            let updates = (poses.as_deref(), updates_tx.as_ref());
+            run_map(self.map, updates, &answers, &mut publish)
         })?;
         let publish = spawn("publish", move || run_publisher(self.snapshots, &snapshots))?;
 
@@ -356,15 +354,20 @@ impl End {
 
 fn run_map(
     mut stage: MapStage,
-    (is_live, updates): (bool, Option<&Sender<KeyframeUpdate>>),
+    (poses, updates): (Option<&Backpressure>, Option<&Sender<KeyframeUpdate>>),
     answers: &Receiver<Answer>,
     publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
 ) -> (MapStage, Arc<Snapshot>, Ending) {
     let mut since_update = Stopwatch::start();
+    stage.step_pool = poses.and_then(|_| own_pool("steps", Niceness::Steps));
     let ending = loop {
-        let answer = if is_live {
+        let answer = if let Some(poses) = poses {
             match answers.try_recv() {
                 Ok(Some(answer)) => Ok(answer),
+                Ok(None) if stage.gives_way(poses) => {
+                    std::thread::sleep(POSE_TICK);
+                    continue;
+                }
                 Ok(None) if stage.step_while_waiting(publish) => {
                     if since_update.secs() > UPDATE_SECS {
                         send_updates(&mut stage, updates);

@@ -122,13 +122,15 @@ fn run_select_live(
 }
 
 /// Who yields to whom where processors are few, as Linux counts it: 0 for everything that a pose waits for. One of
-/// niceness 5 gets a third of the time beside one of 0, one of 10 a tenth.
+/// niceness 5 gets a third of the time beside one of 0, one of 10 a tenth, one of 14 a twentieth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Niceness {
-    /// Poses and depth of keyframes.
-    Geometry = 5,
+    /// Poses of keyframes.
+    Geometry = 1,
+    /// Their depth.
+    Depth = 10,
     /// Optimiser steps.
-    Map = 10,
+    Steps = 14,
 }
 
 /// Live: parallel loops of one stage must not wait behind those of another in the pool that all share. They get threads of
@@ -138,17 +140,22 @@ pub(crate) fn in_own_pool<T: Send>(
     niceness: Niceness,
     work: impl FnOnce() -> T + Send,
 ) -> T {
+    match own_pool(name, niceness) {
+        Some(pool) => pool.install(work),
+        None => work(),
+    }
+}
+
+/// `None`, with a warning: the system has no threads left.
+pub(crate) fn own_pool(name: &'static str, niceness: Niceness) -> Option<rayon::ThreadPool> {
     let pool = rayon::ThreadPoolBuilder::new()
         .thread_name(move |ix| format!("{name}-{ix}"))
         .start_handler(move |_| priority::lower_this_thread(niceness as i32))
         .build();
-    match pool {
-        Ok(pool) => pool.install(work),
-        Err(e) => {
-            tracing::warn!("{name} shares its threads with other stages; poses may be late: {e}");
-            work()
-        }
+    if let Err(e) = &pool {
+        tracing::warn!("{name} shares its threads with other stages; poses may be late: {e}");
     }
+    pool.ok()
 }
 
 pub(crate) fn joined<T>(name: &str, thread: std::thread::JoinHandle<T>) -> anyhow::Result<T> {

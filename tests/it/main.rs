@@ -58,6 +58,7 @@ mod sent_corrections;
 mod sfm;
 mod sfm_batches;
 mod sfm_lenses;
+mod sfm_live;
 mod shader_layouts;
 mod shaders;
 mod sizes;

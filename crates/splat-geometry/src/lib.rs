@@ -17,9 +17,9 @@ pub mod inference;
 
 pub mod error;
 
-pub mod model;
-
 pub mod mvs;
+
+pub mod model;
 
 pub mod optim;
 

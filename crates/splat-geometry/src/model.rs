@@ -2,7 +2,16 @@
 
 use crate::answer::GeometryBatch;
 use crate::error::GeometryError;
+use crate::mvs::depth_stream::{SweepJob, SweptDepth};
 use splat_types::frame::Batch;
+
+/// Depth of a keyframe.
+#[derive(Debug)]
+pub enum DepthTask {
+    Known(GeometryBatch),
+    /// Long work for another thread, so that poses need not wait for it; then `take_depth`.
+    Sweep(Box<SweepJob>),
+}
 
 /// Estimates cameras and depth. One thread owns it; calls come in order of batches.
 pub trait GeometryModel: Send {
@@ -16,8 +25,18 @@ pub trait GeometryModel: Send {
         None
     }
 
-    /// Depth of one keyframe whose pose `poses` reported; `None` when it is known of all.
-    fn depth(&mut self) -> Option<GeometryBatch> {
+    /// Live, while no batch waits: poses that are better by what `poses` left for later; `None` where nothing was left.
+    fn refine(&mut self) -> Option<GeometryBatch> {
+        None
+    }
+
+    /// Depth of one keyframe whose pose `poses` reported; `None` when it is known of all, or is being worked on.
+    fn depth(&mut self) -> Option<DepthTask> {
+        None
+    }
+
+    /// What the work that `depth` handed out has found.
+    fn take_depth(&mut self, _swept: SweptDepth) -> Option<GeometryBatch> {
         None
     }
 

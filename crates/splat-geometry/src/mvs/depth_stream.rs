@@ -19,7 +19,8 @@ use splat_types::transform::Rigid;
 #[derive(Debug)]
 pub struct DepthStream {
     params: MvsParams,
-    matcher: Matcher,
+    /// `None` while a sweep has it.
+    matcher: Option<Matcher>,
     max_keyframes: usize,
     held: BTreeMap<u32, StoredDepth>,
     n_sweeps: u64,
@@ -44,6 +45,52 @@ struct Source {
     source_from_cam: Rigid,
 }
 
+/// A sweep on its way to the thread that makes it: images with their poses of the moment, and the machine that matches.
+#[derive(Debug)]
+pub struct SweepJob {
+    keyframe_id: u32,
+    reference: Prepared,
+    /// By keyframe.
+    sources: Vec<(u32, Prepared)>,
+    range: (f64, f64),
+    params: MvsParams,
+    matcher: Matcher,
+}
+
+/// What a sweep found, on its way back.
+#[derive(Debug)]
+pub struct SweptDepth {
+    keyframe_id: u32,
+    raw: RawDepth,
+    sources: Vec<Source>,
+    matcher: Matcher,
+}
+
+impl SweepJob {
+    /// Matches; takes tens to hundreds of milliseconds on a CPU.
+    pub fn run(mut self) -> SweptDepth {
+        let (near, far) = self.range;
+        let (keyframe_id, n_sources) = (self.keyframe_id, self.sources.len());
+        tracing::debug!(keyframe_id, n_sources, near, far, "sweep");
+        let images: Vec<&Prepared> = self.sources.iter().map(|(_, source)| source).collect();
+        let raw = match SweepTask::new(&self.reference, &images, self.range, &self.params) {
+            Some(task) => task.raw_depth(self.matcher.winners(&task)),
+            None => RawDepth::empty(self.reference.intrinsics),
+        };
+        let source = |(id, source): &(u32, Prepared)| Source {
+            keyframe_id: *id,
+            intrinsics: source.intrinsics,
+            source_from_cam: source.submap_from_cam.inverse() * self.reference.submap_from_cam,
+        };
+        SweptDepth {
+            keyframe_id,
+            raw,
+            sources: self.sources.iter().map(source).collect(),
+            matcher: self.matcher,
+        }
+    }
+}
+
 /// Views that a depth map is checked against.
 const MAX_VERIFIERS: usize = 12;
 /// Points of a depth map that stand for it when neighbours are chosen.
@@ -53,7 +100,7 @@ impl DepthStream {
     /// An error where the parameters insist on a GPU and there is none.
     pub fn new(params: MvsParams, max_keyframes: usize) -> Result<Self, GpuError> {
         Ok(Self {
-            matcher: Matcher::new(params.backend)?,
+            matcher: Some(Matcher::new(params.backend)?),
             params,
             max_keyframes: max_keyframes.max(1),
             held: BTreeMap::new(),
@@ -96,33 +143,47 @@ impl DepthStream {
 
     /// Matches a held keyframe again, with the poses of this moment. Does nothing for an id that is not held.
     pub fn resweep(&mut self, keyframe_id: u32, near: f64, far: f64, neighbours: &[u32]) {
-        let Some(held) = self.held.get(&keyframe_id) else {
-            return;
-        };
-        let reference = &held.prepared;
+        if let Some(job) = self.sweep_job(keyframe_id, near, far, neighbours) {
+            let swept = job.run();
+            self.take(swept);
+        }
+    }
+
+    /// The same as work for another thread; the pose of each view is that of this moment, and may be revised meanwhile. `None`:
+    /// the id is not held, has no neighbours that are, or another sweep is on its way.
+    pub fn sweep_job(
+        &mut self,
+        keyframe_id: u32,
+        near: f64,
+        far: f64,
+        neighbours: &[u32],
+    ) -> Option<SweepJob> {
+        let reference = self.held.get(&keyframe_id)?.prepared.clone();
         let usable = neighbours.iter().filter(|id| **id != keyframe_id);
-        let sources: Vec<(u32, &Prepared)> = usable
-            .filter_map(|id| Some((*id, &self.held.get(id)?.prepared)))
+        let sources: Vec<(u32, Prepared)> = usable
+            .filter_map(|id| Some((*id, self.held.get(id)?.prepared.clone())))
             .take(self.params.source_views)
             .collect();
-        let images: Vec<&Prepared> = sources.iter().map(|(_, prepared)| *prepared).collect();
-        tracing::debug!(keyframe_id, n_sources = sources.len(), near, far, "sweep");
-        let raw = match SweepTask::new(reference, &images, (near, far), &self.params) {
-            Some(task) => task.raw_depth(self.matcher.winners(&task)),
-            None => RawDepth::empty(reference.intrinsics),
-        };
-        let sources = sources
-            .iter()
-            .map(|(id, source)| Source {
-                keyframe_id: *id,
-                intrinsics: source.intrinsics,
-                source_from_cam: source.submap_from_cam.inverse() * reference.submap_from_cam,
-            })
-            .collect();
-        if let Some(held) = self.held.get_mut(&keyframe_id) {
-            held.swept_intrinsics = held.prepared.intrinsics;
-            held.raw = raw;
-            held.sources = sources;
+        if sources.is_empty() {
+            return None;
+        }
+        Some(SweepJob {
+            keyframe_id,
+            reference,
+            sources,
+            range: (near, far),
+            params: self.params.clone(),
+            matcher: self.matcher.take()?,
+        })
+    }
+
+    /// Takes over what a sweep has found; of a keyframe that is no longer held, nothing.
+    pub fn take(&mut self, swept: SweptDepth) {
+        self.matcher = Some(swept.matcher);
+        if let Some(held) = self.held.get_mut(&swept.keyframe_id) {
+            held.swept_intrinsics = swept.raw.intrinsics;
+            held.raw = swept.raw;
+            held.sources = swept.sources;
         }
     }
 
@@ -205,8 +266,8 @@ impl DepthStream {
     }
 
     #[cfg(test)]
-    pub(crate) fn matcher(&self) -> &Matcher {
-        &self.matcher
+    pub(crate) fn matcher(&self) -> Option<&Matcher> {
+        self.matcher.as_ref()
     }
 
     pub fn holds(&self, keyframe_id: u32) -> bool {

@@ -5,6 +5,8 @@
 //! a lens darker towards its rim). Without that a pixel could not be determined by its own luma in images of a camera that
 //! sets its exposure by itself.
 
+use std::sync::Arc;
+
 use crate::mvs::luma::Grey;
 use crate::mvs::luma_map::LumaFit;
 use crate::mvs::planes::Planes;
@@ -265,13 +267,13 @@ fn coarse(view: &Prepared) -> Option<Prepared> {
     (intrinsics.fx, intrinsics.fy) = (intrinsics.fx * scale, intrinsics.fy * scale);
     (intrinsics.cx, intrinsics.cy) = (intrinsics.cx * scale, intrinsics.cy * scale);
     Some(Prepared {
-        grey: Grey {
+        grey: Arc::new(Grey {
             width,
             height,
             values: values.collect(),
             colours: Vec::new(),
-        },
-        fine: Grey::empty(),
+        }),
+        fine: Arc::new(Grey::empty()),
         intrinsics,
         submap_from_cam: view.submap_from_cam,
     })

@@ -144,6 +144,8 @@ impl<'a> Vote<'a> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::mvs::luma::Grey;
     use splat_types::camera::Intrinsics;
@@ -165,8 +167,8 @@ mod tests {
             colours: colours.collect(),
         };
         let prepared = Prepared {
-            fine: grey.clone(),
-            grey,
+            fine: Arc::new(grey.clone()),
+            grey: Arc::new(grey),
             intrinsics: Intrinsics {
                 width_px: SIDE_PX as u32,
                 height_px: SIDE_PX as u32,

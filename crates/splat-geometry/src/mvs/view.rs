@@ -46,12 +46,13 @@ impl RawDepth {
     }
 }
 
-/// What matching needs of a view: grey, at the size of the depth map.
+/// What matching needs of a view: grey, at the size of the depth map. Images are shared, since a sweep on another thread reads
+/// them while the pose is revised.
 #[derive(Debug, Clone)]
 pub(crate) struct Prepared {
-    pub(crate) grey: Grey,
+    pub(crate) grey: Arc<Grey>,
     /// The same image at up to twice the size, for what is narrower than a window.
-    pub(crate) fine: Grey,
+    pub(crate) fine: Arc<Grey>,
     pub(crate) intrinsics: Intrinsics,
     pub(crate) submap_from_cam: Rigid,
 }
@@ -64,8 +65,8 @@ impl Prepared {
             .intrinsics
             .resized(grey.width as u32, grey.height as u32);
         Self {
-            grey,
-            fine,
+            grey: Arc::new(grey),
+            fine: Arc::new(fine),
             intrinsics,
             submap_from_cam: view.submap_from_cam,
         }

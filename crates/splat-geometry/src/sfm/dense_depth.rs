@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use crate::answer::{GeometryBatch, Observations, PoseStd, PoseUpdate, View};
-use crate::mvs::depth_stream::DepthStream;
+use crate::mvs::depth_stream::{DepthStream, SweepJob, SweptDepth};
 use crate::mvs::neighbours::depth_range;
 use crate::mvs::params::MvsParams;
 use crate::mvs::view::MvsView;
@@ -32,6 +32,16 @@ pub(crate) struct Densifier {
     /// Views whose poses were reported: those without depth, and those whose depth may be better by now.
     waiting: VecDeque<SparseView>,
     again: VecDeque<SparseView>,
+    /// The view whose sweep is on its way.
+    at_work: Option<SparseView>,
+}
+
+/// What there is to do for the depth of reported views.
+#[derive(Debug)]
+pub(crate) enum NextDepth {
+    /// The view's depth is known as it stands.
+    Known(Box<View>),
+    Sweep(Box<SweepJob>),
 }
 
 impl Densifier {
@@ -42,6 +52,7 @@ impl Densifier {
             lenses: BTreeMap::new(),
             waiting: VecDeque::new(),
             again: VecDeque::new(),
+            at_work: None,
         })
     }
 
@@ -68,6 +79,7 @@ impl Densifier {
         self.take_in(&sparse, image_of);
         for revision in &sparse.revised {
             let waiting = self.waiting.iter_mut().chain(&mut self.again);
+            let waiting = waiting.chain(&mut self.at_work);
             for view in waiting.filter(|view| view.keyframe_id == revision.keyframe_id) {
                 move_to(view, revision);
             }
@@ -93,10 +105,26 @@ impl Densifier {
         reported
     }
 
-    /// One more view with depth, of those whose poses were reported: the newest, since frames are tracked by it.
-    pub(crate) fn next(&mut self) -> Option<View> {
+    /// Depth of one more view of those whose poses were reported: of the newest, since frames are tracked by it. `None`: none
+    /// waits, or the sweep of another is on its way.
+    pub(crate) fn next(&mut self) -> Option<NextDepth> {
+        if self.at_work.is_some() {
+            return None;
+        }
         let view = self.waiting.pop_back().or_else(|| self.again.pop_front())?;
-        self.sweep(&view);
+        Some(match self.sweep_of(&view) {
+            Some(job) => {
+                self.at_work = Some(view);
+                NextDepth::Sweep(Box::new(job))
+            }
+            None => NextDepth::Known(Box::new(self.view(&view))),
+        })
+    }
+
+    /// A sweep has come back.
+    pub(crate) fn take(&mut self, swept: SweptDepth) -> Option<View> {
+        self.state.take(swept);
+        let view = self.at_work.take()?;
         Some(self.view(&view))
     }
 
@@ -142,8 +170,14 @@ impl Densifier {
         }
     }
 
-    /// Sweeps a new view, and one swept before when it had too few sources or its camera has moved.
     fn sweep(&mut self, view: &SparseView) {
+        if let Some(job) = self.sweep_of(view) {
+            self.state.take(job.run());
+        }
+    }
+
+    /// For a new view, and for one swept before when it had too few sources or its camera has moved.
+    fn sweep_of(&mut self, view: &SparseView) -> Option<SweepJob> {
         let id = view.keyframe_id;
         let neighbours: Vec<u32> = view
             .neighbours
@@ -163,11 +197,8 @@ impl Densifier {
             .iter()
             .map(|l| cam_from_submap.transform_point(l.point_in_submap).z)
             .collect();
-        let Some((near, far)) = depth_range(&depths).filter(|_| !is_current && n_sources > 0)
-        else {
-            return;
-        };
-        self.state.resweep(id, near, far, &neighbours);
+        let (near, far) = depth_range(&depths).filter(|_| !is_current && n_sources > 0)?;
+        self.state.sweep_job(id, near, far, &neighbours)
     }
 
     fn view(&self, view: &SparseView) -> View {

@@ -4,21 +4,22 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::answer::GeometryBatch;
+use crate::answer::{GeometryBatch, View};
 use crate::error::GeometryError;
 use crate::features::descriptor::{Features, working_image, working_size};
 use crate::features::extractor::FeatureExtractor;
 use crate::matching::PreparedDescriptors;
-use crate::model::GeometryModel;
+use crate::model::{DepthTask, GeometryModel};
+use crate::mvs::depth_stream::SweptDepth;
 use crate::mvs::params::MvsParams;
 use crate::sfm::adjust::adjust_global;
 use crate::sfm::calibrate::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use crate::sfm::close_loops::{release_waiting, settle};
-use crate::sfm::dense_depth::Densifier;
+use crate::sfm::dense_depth::{Densifier, NextDepth};
 use crate::sfm::initialize::{Start, start};
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::merge;
-use crate::sfm::pairwise::{link_alike, link_anew, link_newest};
+use crate::sfm::pairwise::{link_alike, link_anew, link_older, link_recent};
 use crate::sfm::params::SfmParams;
 use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView};
 use crate::sfm::register::grow;
@@ -35,6 +36,8 @@ const MIN_NEW_SUBMAP: usize = 4;
 const MAX_WAITING: usize = 64;
 /// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
 const MAX_IMAGES: usize = 128;
+/// Live: views that may wait for their places of long ago to be looked for.
+const MAX_BEHIND: usize = 16;
 /// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
 const FIRST_FOCAL: f64 = 0.9;
 
@@ -51,6 +54,8 @@ pub struct Sfm {
     last_start: Option<Start>,
     /// A loop was closed since the last report.
     is_loop: bool,
+    /// Live: views that are not yet compared with those long before them.
+    behind: Vec<usize>,
 }
 
 impl Sfm {
@@ -66,6 +71,7 @@ impl Sfm {
             batch_id: 0,
             last_start: None,
             is_loop: false,
+            behind: Vec::new(),
         })
     }
 
@@ -73,12 +79,53 @@ impl Sfm {
     pub fn sparse(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
         let limits = self.take_in(&batch.keyframes);
-        let waiting = self.waiting();
-        let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
-        self.place_waiting(newest, &limits, MIN_NEW_SUBMAP);
-        self.adjust_grown(&limits);
+        self.catch_up(&limits);
         let shared = self.shared_views(batch);
         self.report(&shared)
+    }
+
+    /// The same sooner: places that were seen long ago and the adjustment of all wait until `refine`, unless they are needed
+    /// to register the new keyframes.
+    fn sparse_soon(&mut self, batch: &Batch) -> SparseBatch {
+        self.batch_id = batch.id;
+        let first_new = self.scene.views.len();
+        let limits = self.take_in_with(&batch.keyframes, link_recent);
+        self.behind.extend(first_new..self.scene.views.len());
+        let fresh = self.behind.clone();
+        grow(&mut self.scene, &fresh, &limits);
+        let is_missing = |ix: &usize| self.scene.views[*ix].registered.is_none();
+        if fresh.iter().any(is_missing) || fresh.len() > MAX_BEHIND {
+            self.link_behind(&limits);
+            self.catch_up(&limits);
+        }
+        let shared = self.shared_views(batch);
+        self.report(&shared)
+    }
+
+    /// What `sparse_soon` has left. `None`: nothing.
+    fn refined(&mut self) -> Option<SparseBatch> {
+        if self.behind.is_empty() {
+            return None;
+        }
+        let newest = self.scene.views.last().map(|v| Arc::clone(&v.keyframe));
+        let limits = self.limits(newest.as_slice());
+        self.link_behind(&limits);
+        self.catch_up(&limits);
+        Some(self.report(&[]))
+    }
+
+    /// Registers what waits by all links, closes loops, and adjusts what has grown.
+    fn catch_up(&mut self, limits: &Limits) {
+        let waiting = self.waiting();
+        let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
+        self.place_waiting(newest, limits, MIN_NEW_SUBMAP);
+        self.adjust_grown(limits);
+    }
+
+    fn link_behind(&mut self, limits: &Limits) {
+        for view_ix in std::mem::take(&mut self.behind) {
+            link_older(&mut self.scene, view_ix, limits.max_error_px, self.seed);
+        }
     }
 
     /// Last chance for what waits, then all is adjusted together.
@@ -119,6 +166,19 @@ impl Sfm {
 
     /// Makes views of the keyframes that are new, and links them to those before.
     pub(crate) fn take_in(&mut self, keyframes: &[Arc<Keyframe>]) -> Limits {
+        let link = |scene: &mut Reconstruction, newest, max_error_px, seed| {
+            link_recent(scene, newest, max_error_px, seed);
+            link_older(scene, newest, max_error_px, seed);
+        };
+        self.take_in_with(keyframes, link)
+    }
+
+    /// Makes views of the keyframes that are new, and calls `link` with each, the limit of errors and a seed.
+    fn take_in_with(
+        &mut self,
+        keyframes: &[Arc<Keyframe>],
+        link: impl Fn(&mut Reconstruction, usize, f64, u64),
+    ) -> Limits {
         let limits = self.limits(keyframes);
         let fresh: Vec<&Arc<Keyframe>> = keyframes
             .iter()
@@ -134,7 +194,8 @@ impl Sfm {
         let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
         for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
             self.push(keyframe, features, size);
-            link_newest(&mut self.scene, limits.max_error_px, self.seed);
+            let newest = self.scene.views.len() - 1;
+            link(&mut self.scene, newest, limits.max_error_px, self.seed);
         }
         self.let_go();
         limits
@@ -308,6 +369,16 @@ impl Sfm {
     }
 }
 
+impl Sfm {
+    fn with_depth(&self, view: View) -> GeometryBatch {
+        GeometryBatch {
+            batch_id: self.batch_id,
+            views: vec![view],
+            ..GeometryBatch::default()
+        }
+    }
+}
+
 impl GeometryModel for Sfm {
     fn accepts_small_batches(&self) -> bool {
         true
@@ -319,18 +390,27 @@ impl GeometryModel for Sfm {
     }
 
     fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
-        let sparse = self.sparse(batch);
+        let sparse = self.sparse_soon(batch);
         let scene = &self.scene;
         Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
     }
 
-    fn depth(&mut self) -> Option<GeometryBatch> {
-        let view = self.densifier.next()?;
-        Some(GeometryBatch {
-            batch_id: self.batch_id,
-            views: vec![view],
-            ..GeometryBatch::default()
+    fn refine(&mut self) -> Option<GeometryBatch> {
+        let sparse = self.refined()?;
+        let scene = &self.scene;
+        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+    }
+
+    fn depth(&mut self) -> Option<DepthTask> {
+        Some(match self.densifier.next()? {
+            NextDepth::Known(view) => DepthTask::Known(self.with_depth(*view)),
+            NextDepth::Sweep(job) => DepthTask::Sweep(job),
         })
+    }
+
+    fn take_depth(&mut self, swept: SweptDepth) -> Option<GeometryBatch> {
+        let view = self.densifier.take(swept)?;
+        Some(self.with_depth(view))
     }
 
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {

@@ -21,10 +21,26 @@ const MAX_ANEW: usize = 64;
 /// Verified matches that make a link; fewer are as likely chance.
 const MIN_LINK: usize = 15;
 
-/// Links the newest view (the last) to earlier ones.
-pub(crate) fn link_newest(scene: &mut Reconstruction, max_error_px: f64, seed: u64) {
-    if let Some(newest) = scene.views.len().checked_sub(1) {
-        link_back(scene, newest, max_error_px, seed);
+/// Links a view to those just before it.
+pub(crate) fn link_recent(
+    scene: &mut Reconstruction,
+    view_ix: usize,
+    max_error_px: f64,
+    seed: u64,
+) {
+    let others: Vec<usize> = (view_ix.saturating_sub(N_RECENT)..view_ix).collect();
+    link(scene, view_ix, &others, max_error_px, seed);
+}
+
+/// Links a view to those long before that look like it.
+pub(crate) fn link_older(scene: &mut Reconstruction, view_ix: usize, max_error_px: f64, seed: u64) {
+    let others = alike(scene, view_ix, view_ix.saturating_sub(N_RECENT));
+    for (other, found) in found(scene, view_ix, &others, max_error_px, seed) {
+        if scene.submaps.is_empty() {
+            insert(scene, view_ix, other, found);
+        } else {
+            scene.held.insert((other, view_ix), found);
+        }
     }
 }
 
@@ -40,25 +56,12 @@ pub(crate) fn link_anew(scene: &mut Reconstruction, max_error_px: f64, seed: u64
         view.failed_with = 0;
     }
     for view_ix in 0..scene.views.len() {
-        link_back(scene, view_ix, max_error_px, seed);
+        link_recent(scene, view_ix, max_error_px, seed);
+        link_older(scene, view_ix, max_error_px, seed);
     }
     for submap in 0..scene.submaps.len() {
         for view_ix in scene.submaps[submap].views.clone() {
             extend(scene, view_ix, max_error_px);
-        }
-    }
-}
-
-fn link_back(scene: &mut Reconstruction, view_ix: usize, max_error_px: f64, seed: u64) {
-    let recent = view_ix.saturating_sub(N_RECENT);
-    let others: Vec<usize> = (recent..view_ix).collect();
-    link(scene, view_ix, &others, max_error_px, seed);
-    let others = alike(scene, view_ix, recent);
-    for (other, found) in found(scene, view_ix, &others, max_error_px, seed) {
-        if scene.submaps.is_empty() {
-            insert(scene, view_ix, other, found);
-        } else {
-            scene.held.insert((other, view_ix), found);
         }
     }
 }

@@ -390,9 +390,9 @@ fn auto_decides_at_the_first_sweep_and_stays_off_software() {
     let (reference, sources) = scene((64, 48), 2);
     let mut state = DepthStream::new(params, 8).unwrap();
     state.add(0, &sources[0], 1.0, 2.0, &[]);
-    assert!(matches!(state.matcher(), Matcher::Undecided));
+    assert!(matches!(state.matcher(), Some(Matcher::Undecided)));
     state.add(1, &reference, RANGE.0, RANGE.1, &[0]);
-    let matcher = state.matcher();
+    let matcher = state.matcher().unwrap();
     assert!(!matches!(matcher, Matcher::Undecided), "a sweep was made");
     if let Matcher::Gpu(gpu) = matcher {
         assert!(!gpu.adapter().contains("llvmpipe"), "{}", gpu.adapter());

@@ -128,7 +128,8 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
             SIZE,
         );
         let limits = sfm.limits(&[]);
-        link_newest(&mut sfm.scene, limits.max_error_px, 1);
+        link_recent(&mut sfm.scene, id, limits.max_error_px, 1);
+        link_older(&mut sfm.scene, id, limits.max_error_px, 1);
         if id % 6 == 5 {
             let waiting = sfm.waiting();
             sfm.place_waiting(&waiting, &limits, MIN_NEW_SUBMAP);
