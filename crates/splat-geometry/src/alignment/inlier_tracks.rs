@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::alignment::depths::{Depths, by_depth};
 use crate::alignment::matched::Matched;
 use crate::alignment::tracks::{MIN_ANGLE_DEG, Track, observation};
-use crate::two_view::triangulate::{Observation, triangulate, widest_angle};
+use crate::two_view::triangulate::{Observation, has_angle, triangulate};
 
 /// A point is at the depth of a view if it is off by less than so many expected errors.
 const MAX_DEPTH_ERRORS: f64 = 5.0;
@@ -84,6 +84,6 @@ fn point(matched: &Matched, track: &Track, depths: &Depths) -> Option<DVec3> {
         .map(Observation::centre_in_world)
         .collect();
     let met = triangulate(&observations)
-        .filter(|p| widest_angle(&centres, *p) >= MIN_ANGLE_DEG.to_radians());
+        .filter(|p| has_angle(centres.iter().copied(), *p, MIN_ANGLE_DEG.to_radians()));
     met.or_else(|| by_depth(matched, track, depths))
 }

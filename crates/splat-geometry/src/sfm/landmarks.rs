@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use crate::sfm::reconstruction::{NONE, Reconstruction};
-use crate::two_view::triangulate::{Observation, triangulate, widest_angle};
+use crate::two_view::triangulate::{Observation, has_angle, triangulate};
 
 /// Below this angle between its rays a point's depth is mostly noise.
 const MIN_ANGLE_DEG: f64 = 1.0;
@@ -140,7 +140,7 @@ fn inlier_point(
     let picked: Vec<Observation<'_>> = fits.iter().map(|&i| observations[i]).collect();
     let point = triangulate(&picked)?;
     let centres: Vec<DVec3> = picked.iter().map(Observation::centre_in_world).collect();
-    let is_sharp = widest_angle(&centres, point) >= MIN_ANGLE_DEG.to_radians();
+    let is_sharp = has_angle(centres.into_iter(), point, MIN_ANGLE_DEG.to_radians());
     let fit_all = picked.iter().all(|s| s.error_px(point) <= max_error_px);
     (is_sharp && fit_all).then(|| (point, fits.iter().map(|&i| seen[i]).collect()))
 }
@@ -158,12 +158,9 @@ pub(crate) fn filter(scene: &mut Reconstruction, landmarks: &[u32], max_error_px
                 .is_some_and(|s| s.error_px(point) <= max_error_px)
         };
         let kept: Vec<(u32, u32)> = seen.iter().copied().filter(fits).collect();
-        let centres: Vec<DVec3> = kept
-            .iter()
-            .filter_map(|at| scene.centre(at.0 as usize))
-            .collect();
+        let centres = kept.iter().filter_map(|at| scene.centre(at.0 as usize));
         let is_sharp =
-            point.is_finite() && widest_angle(&centres, point) >= 0.7 * MIN_ANGLE_DEG.to_radians();
+            point.is_finite() && has_angle(centres, point, 0.7 * MIN_ANGLE_DEG.to_radians());
         if !is_sharp || kept.len() < seen.len() {
             scene.retain_observations(landmark, |at| is_sharp && kept.contains(at));
         }

@@ -248,28 +248,29 @@ fn neighbours(scene: &Reconstruction, view_ix: usize) -> Vec<Neighbour> {
     let Some(own) = scene.centre(view_ix) else {
         return Vec::new();
     };
-    let mut angles: BTreeMap<u32, Vec<f64>> = BTreeMap::new();
+    let centres: Vec<Option<DVec3>> = (0..scene.views.len()).map(|ix| scene.centre(ix)).collect();
+    // Of each view, sine and cosine of the angles, up to a factor.
+    let mut angles: BTreeMap<u32, Vec<[f64; 2]>> = BTreeMap::new();
     for &landmark in scene.views[view_ix]
         .landmark_of
         .iter()
         .filter(|l| **l != NONE)
     {
         let landmark = &scene.landmarks[landmark as usize];
+        let a = own - landmark.point;
         for &(other, _) in landmark.seen.iter().filter(|s| s.0 as usize != view_ix) {
-            let Some(centre) = scene.centre(other as usize) else {
+            let Some(centre) = centres[other as usize] else {
                 continue;
             };
-            let (a, b) = (own - landmark.point, centre - landmark.point);
-            angles
-                .entry(other)
-                .or_default()
-                .push(a.cross(b).length().atan2(a.dot(b)).to_degrees());
+            let b = centre - landmark.point;
+            let angle = [a.cross(b).length(), a.dot(b)];
+            angles.entry(other).or_default().push(angle);
         }
     }
-    let neighbour = |(other, mut angles): (u32, Vec<f64>)| Neighbour {
+    let neighbour = |(other, mut angles): (u32, Vec<[f64; 2]>)| Neighbour {
         keyframe_id: scene.views[other as usize].keyframe.id,
         n_shared: angles.len() as u32,
-        angle_deg: median(&mut angles).unwrap_or(0.0),
+        angle_deg: median_angle_deg(&mut angles),
     };
     // Matching wants an angle of about 6 degrees (GEOMETRY.md 3): less gives no depth, more changes the image.
     let worth = |n: &Neighbour| {
@@ -283,4 +284,34 @@ fn neighbours(scene: &Reconstruction, view_ix: usize) -> Vec<Neighbour> {
             .then(a.keyframe_id.cmp(&b.keyframe_id))
     });
     found
+}
+
+/// Of angles from 0 to 180 degrees, each given by its sine and cosine up to a factor; 0 of none.
+fn median_angle_deg(angles: &mut [[f64; 2]]) -> f64 {
+    if angles.is_empty() {
+        return 0.0;
+    }
+    // The sine of the difference of two angles says which is larger, and takes no arctangent.
+    let middle = angles.len() / 2;
+    let order = |a: &[f64; 2], b: &[f64; 2]| (a[0] * b[1]).total_cmp(&(b[0] * a[1]));
+    let [sine, cosine] = *angles.select_nth_unstable_by(middle, order).1;
+    sine.atan2(cosine).to_degrees()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::median_angle_deg;
+
+    #[test]
+    fn the_middle_angle_is_found_whatever_the_lengths() {
+        let mut angles: Vec<[f64; 2]> = (0..181)
+            .map(|deg| {
+                let (sine, cosine) = f64::from(deg * 37 % 181).to_radians().sin_cos();
+                [sine, cosine].map(|v| v * f64::from(1 + deg % 7))
+            })
+            .collect();
+        assert!((median_angle_deg(&mut angles) - 90.0).abs() < 1e-9);
+        assert!((median_angle_deg(&mut [[3.0, 3.0]]) - 45.0).abs() < 1e-9);
+        assert_eq!(median_angle_deg(&mut []), 0.0);
+    }
 }

@@ -56,17 +56,39 @@ pub fn triangulate(observations: &[Observation<'_>]) -> Option<DVec3> {
 
 /// Largest angle in radians between any two rays to the point.
 pub fn widest_angle(centres: &[DVec3], point: DVec3) -> f64 {
-    let rays: Vec<DVec3> = centres
-        .iter()
-        .map(|c| (point - *c).normalize_or_zero())
-        .collect();
-    let pairs = rays
-        .iter()
-        .enumerate()
-        .flat_map(|(i, a)| rays[i + 1..].iter().map(move |b| (a, b)));
-    pairs
-        .map(|(a, b)| a.cross(*b).length().atan2(a.dot(*b)))
-        .fold(0.0, f64::max)
+    let rays: Vec<DVec3> = rays(centres.iter().copied(), point).collect();
+    let mut widest: Option<(f64, DVec3, DVec3)> = None;
+    for (i, a) in rays.iter().enumerate() {
+        for b in &rays[i + 1..] {
+            // Between unit vectors the distance grows with the angle, and takes no arctangent.
+            let distance = a.distance_squared(*b);
+            if widest.is_none_or(|(most, ..)| distance > most) {
+                widest = Some((distance, *a, *b));
+            }
+        }
+    }
+    widest.map_or(0.0, |(_, a, b)| a.cross(b).length().atan2(a.dot(b)))
+}
+
+/// Whether two of the rays to the point are `min_angle` radians apart or more; looks at no more of them than that takes.
+pub fn has_angle(centres: impl Iterator<Item = DVec3>, point: DVec3, min_angle: f64) -> bool {
+    let least = (2.0 * (0.5 * min_angle).sin()).powi(2);
+    let mut seen: Vec<DVec3> = Vec::new();
+    for ray in rays(centres, point) {
+        if seen
+            .iter()
+            .any(|other| ray.distance_squared(*other) >= least)
+        {
+            return true;
+        }
+        seen.push(ray);
+    }
+    false
+}
+
+/// Unit vectors from the centres to the point; none from a centre that is the point.
+fn rays(centres: impl Iterator<Item = DVec3>, point: DVec3) -> impl Iterator<Item = DVec3> {
+    centres.filter_map(move |centre| (point - centre).try_normalize())
 }
 
 fn polished(observations: &[Observation<'_>], point: DVec3) -> Option<DVec3> {
