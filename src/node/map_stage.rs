@@ -54,10 +54,9 @@ pub(crate) struct SelectStage {
 pub(crate) struct MapStage {
     pub(crate) map: Mapper,
     params: MapperParams,
-    is_live: bool,
+    /// `None` in a replay.
+    pub(crate) live: Option<LiveSteps>,
     n_frames: Option<u64>,
-    /// Live: the threads that make steps; `None`: those that all share.
-    pub(crate) step_pool: Option<rayon::ThreadPool>,
     pub(crate) request_handler: RequestHandler,
     /// Live: frames of the tracker to look at while there is nothing else to do.
     pub(crate) fitter: Option<RefinementWorker>,
@@ -65,9 +64,16 @@ pub(crate) struct MapStage {
     pub(crate) autosave: Option<Autosave>,
     pub(crate) recovery: Recovery,
     since_snapshot: Stopwatch,
-    since_step: Stopwatch,
     grace: ShutdownTimeout,
     pub(crate) figures: MapFigures,
+}
+
+/// Live: when steps are made, and by which threads.
+#[derive(Debug)]
+pub(crate) struct LiveSteps {
+    /// `None`: the threads that all share.
+    pub(crate) pool: Option<rayon::ThreadPool>,
+    since_last: Stopwatch,
 }
 
 /// What became of the keyframes that came, and how long it took.
@@ -154,17 +160,18 @@ impl MapStage {
         Self {
             map,
             params: params.mapper(),
-            is_live,
+            live: is_live.then(|| LiveSteps {
+                pool: None,
+                since_last: Stopwatch::start(),
+            }),
             request_handler: RequestHandler::new(calls.flatten(), &params.track, stop.clone()),
             grace: ShutdownTimeout::new(stop),
             n_frames,
-            step_pool: None,
             fitter: None,
             reports,
             autosave: None,
             recovery,
             since_snapshot: Stopwatch::start(),
-            since_step: Stopwatch::start(),
             figures: MapFigures::default(),
         }
     }
@@ -202,7 +209,7 @@ impl MapStage {
         }
         self.figures.optimise_secs += watch.secs();
         self.report_counts();
-        if !self.is_live {
+        if self.live.is_none() {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
         }
@@ -210,7 +217,9 @@ impl MapStage {
 
     /// Live: whether splats wait, since poses of keyframes are at work; now and then a step is made all the same.
     pub(crate) fn gives_way(&mut self, poses: &Backpressure) -> bool {
-        poses.is_at_work() && self.since_step.secs() < MAX_SECS_WITHOUT_STEP
+        let live = self.live.as_ref();
+        poses.is_at_work()
+            && live.is_some_and(|live| live.since_last.secs() < MAX_SECS_WITHOUT_STEP)
     }
 
     /// Live: a few steps, if any are left to make. Returns whether some were made.
@@ -221,7 +230,9 @@ impl MapStage {
         if self.map.is_settled() {
             return false;
         }
-        self.since_step = Stopwatch::start();
+        if let Some(live) = &mut self.live {
+            live.since_last = Stopwatch::start();
+        }
         let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
         let target = (self.map.n_steps() + LIVE_STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
@@ -345,7 +356,7 @@ impl MapStage {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
             let phase = phase(self.map.n_steps());
             let map = &mut self.map;
-            let made = match &self.step_pool {
+            let made = match self.live.as_ref().and_then(|live| live.pool.as_ref()) {
                 Some(pool) => pool.install(|| map.step(n, phase)),
                 None => map.step(n, phase),
             };
@@ -359,7 +370,7 @@ impl MapStage {
         }
     }
 
-    fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+    pub(crate) fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
         let is_due = self.since_snapshot.secs() >= self.params.map.snapshot_secs;
         if is_due
             && self.map.n_splats() > 0
@@ -403,7 +414,7 @@ impl MapStage {
             n_registered: self.map.n_keyframes(),
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
-            steps_planned: if self.is_live {
+            steps_planned: if self.live.is_some() {
                 0
             } else {
                 self.params.train.steps

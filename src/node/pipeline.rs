@@ -359,12 +359,15 @@ fn run_map(
     publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
 ) -> (MapStage, Arc<Snapshot>, Ending) {
     let mut since_update = Stopwatch::start();
-    stage.step_pool = poses.and_then(|_| own_pool("steps", Niceness::Steps));
+    if let Some(live) = &mut stage.live {
+        live.pool = own_pool("steps", Niceness::Steps);
+    }
     let ending = loop {
         let answer = if let Some(poses) = poses {
             match answers.try_recv() {
                 Ok(Some(answer)) => Ok(answer),
                 Ok(None) if stage.gives_way(poses) => {
+                    stage.snapshot_if_due(publish);
                     std::thread::sleep(POSE_TICK);
                     continue;
                 }

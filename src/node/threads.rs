@@ -122,15 +122,15 @@ fn run_select_live(
 }
 
 /// Who yields to whom where processors are few, as Linux counts it: 0 for everything that a pose waits for. One of
-/// niceness 5 gets a third of the time beside one of 0, one of 10 a tenth, one of 14 a twentieth.
+/// niceness 5 gets a third of the time beside one of 0, one of 8 a sixth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Niceness {
     /// Poses of keyframes.
     Geometry = 1,
     /// Their depth.
-    Depth = 10,
+    Depth = 5,
     /// Optimiser steps.
-    Steps = 14,
+    Steps = 8,
 }
 
 /// Live: parallel loops of one stage must not wait behind those of another in the pool that all share. They get threads of
