@@ -397,12 +397,15 @@ fn most_frequent(ids: impl Iterator<Item = u32>) -> u32 {
 
 /// A keyframe's covariance in the axes of a camera beside it; zero where it is not known.
 fn carried(of_key: Option<&Covariance>, cam_from_key: &Rigid) -> Matrix6<f64> {
-    let Some(of_key) = of_key else {
-        return Matrix6::zeros();
-    };
-    let of_key = Matrix6::from_fn(|i, j| of_key[i][j]);
-    let carry = adjoint(cam_from_key);
-    carry * of_key * carry.transpose()
+    of_key.map_or_else(Matrix6::zeros, |of_key| {
+        transported(&Matrix6::from_fn(|i, j| of_key[i][j]), cam_from_key)
+    })
+}
+
+/// The covariance of one camera in the axes of another that is rigidly beside it.
+pub(crate) fn transported(of_source: &Matrix6<f64>, target_from_source: &Rigid) -> Matrix6<f64> {
+    let carry = adjoint(target_from_source);
+    carry * of_source * carry.transpose()
 }
 
 /// Takes a small motion of the source in its own axes to that of the target, translation first.

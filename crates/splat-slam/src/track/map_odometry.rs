@@ -1,12 +1,12 @@
 //! Visual odometry, and what its poses are in the map: by the newest keyframe, or before there is one.
 
 use crate::track::landmarks::KeyframeView;
-use crate::track::odometry_link::{LinkedKeyframe, LinkedPose, OdometryLink};
+use crate::track::odometry_link::{LinkedKeyframe, LinkedMotion, LinkedPose, OdometryLink};
 use crate::visual_odometry::odometry::{OdometryPose, VisualOdometry};
 use crate::working_camera::WorkingCamera;
 use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
-use splat_types::transform::Similarity;
+use splat_types::transform::{Rigid, Similarity};
 
 /// The camera of the newest keyframe, as the map has refined it, and what the source said of it.
 #[derive(Debug, Clone, Copy)]
@@ -81,6 +81,16 @@ impl MapOdometry {
     /// Where a frame is by a keyframe and the odometry since.
     pub(crate) fn locate(&self, seq: u64) -> Option<LinkedPose> {
         self.link.locate(seq)
+    }
+
+    /// How the camera has moved between two frames.
+    pub(crate) fn motion(&self, earlier: u64, later: u64) -> Option<LinkedMotion> {
+        self.link.motion(earlier, later)
+    }
+
+    /// The pose of a frame that the map has reached in the keyframe before it, by the keyframes on both sides.
+    pub(crate) fn between_keyframes(&self, seq: u64) -> Option<(u32, Rigid)> {
+        self.link.between_keyframes(seq)
     }
 
     /// Whether a pose is to be reported in odometry's frame, as there is no map: the first segment's.

@@ -14,7 +14,7 @@ use crate::track::anchor::Anchor;
 use crate::track::history::{FrameTrack, History, Tracks};
 use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
 use crate::track::landmarks::{KeyframeView, Landmarks};
-use crate::track::localize::{Hint, Localized, Localizer};
+use crate::track::localize::{Hint, Localized, Localizer, transported};
 use crate::track::map_odometry::MapOdometry;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
@@ -35,19 +35,37 @@ const LOOK_AHEAD: f64 = 0.7;
 /// Design effects of single frames beyond it are outliers.
 const MAX_DESIGN: f64 = 25.0;
 
+/// Where odometry goes on from a keyframe, seconds between frames that are looked for among the landmarks all the same: so far a
+/// wrong pose may go unnoticed. Finding corners takes most of the time that a frame takes.
+const MATCH_SECS: f64 = 0.19;
+
 /// What was kept of a frame, and its number in the history.
 #[derive(Debug)]
 struct Waiting {
-    seen: Arc<Observation>,
+    seq: u64,
+    stamp: Stamp,
+    /// `None`: odometry said where it was.
+    seen: Option<Arc<Observation>>,
     history_ix: usize,
 }
 
-/// How the search for a frame that the motion does not lead to stands.
+/// A frame whose pose is by landmarks.
+#[derive(Debug, Clone, Copy)]
+struct FoundFrame {
+    seq: u64,
+    anchor: Anchor,
+    covariance: Matrix6<f64>,
+}
+
+/// Which frames were looked for among the landmarks.
 #[derive(Debug, Default)]
 struct Search {
+    last: Option<Stamp>,
+    /// The last frame whose pose is by landmarks.
+    found: Option<FoundFrame>,
     /// Frames without a measured pose since the last one with.
     n_failed: usize,
-    /// Keyframe from which it goes on.
+    /// Keyframe from which the search for a frame that the motion does not lead to goes on.
     next: usize,
 }
 
@@ -125,17 +143,25 @@ impl Tracker {
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
         let odometry = self.odometry.follow(frame);
+        let linked = self.linked(frame.seq);
+        if let Some((linked, pose)) = &linked
+            && !self.is_match_due(frame.stamp)
+        {
+            let tracked = self.carried((frame.seq, frame.stamp), linked, pose);
+            self.keep(None, &tracked, None);
+            return tracked;
+        }
+        self.search.last = Some(frame.stamp);
         let seen = Arc::new(Observation::of(frame, &self.params));
-        let linked = self.linked(seen.seq);
         let guess = linked.as_ref().map(|(_, pose)| pose.inverse());
         let tracked = match (self.find(&seen, guess), linked) {
             (Ok((located, by_search)), linked) => match linked {
                 Some((linked, pose)) if self.is_surer(&linked, &located) => {
-                    self.carried(&seen, &linked, &pose)
+                    self.carried((seen.seq, seen.stamp), &linked, &pose)
                 }
                 _ => self.found(&seen, &located, by_search),
             },
-            (Err(_), Some((linked, pose))) => self.carried(&seen, &linked, &pose),
+            (Err(_), Some((linked, pose))) => self.carried((seen.seq, seen.stamp), &linked, &pose),
             (Err(reason), None) => {
                 match odometry.filter(|pose| self.odometry.reports_before_map(pose)) {
                     Some(pose) => return self.ahead_of_map(seen, &pose),
@@ -143,19 +169,37 @@ impl Tracker {
                 }
             }
         };
-        self.keep(seen, &tracked, None);
+        self.keep(Some(seen), &tracked, None);
         tracked
     }
 
+    /// Whether a frame whose place odometry knows is looked for among the landmarks, too.
+    fn is_match_due(&self, stamp: Stamp) -> bool {
+        // A stamp that goes back says nothing of the time that has passed.
+        let since = self.search.last.map(|last| stamp.secs_since(last));
+        self.state != TrackState::Tracking
+            || since.is_none_or(|secs| !(0.0..MATCH_SECS).contains(&secs))
+    }
+
     /// Keeps a frame for a second look. `segment`: of odometry, where the pose is in its frame.
-    fn keep(&mut self, seen: Arc<Observation>, tracked: &TrackedFrame, segment: Option<u32>) {
-        self.last_stamp = Some(seen.stamp);
+    fn keep(
+        &mut self,
+        seen: Option<Arc<Observation>>,
+        tracked: &TrackedFrame,
+        segment: Option<u32>,
+    ) {
+        self.last_stamp = Some(tracked.stamp);
         let anchor = self.anchor.filter(|_| tracked.is_measured());
         let history_ix = self.history.push(tracked, anchor);
         if let Some(segment) = segment {
             self.history.reported_in(segment);
         }
-        self.waiting.push_back(Waiting { seen, history_ix });
+        self.waiting.push_back(Waiting {
+            seq: tracked.seq,
+            stamp: tracked.stamp,
+            seen,
+            history_ix,
+        });
         if self.waiting.len() > self.params.max_deferred_frames {
             self.waiting.pop_front();
         }
@@ -171,8 +215,10 @@ impl Tracker {
     pub fn update(&mut self, views: &[KeyframeView]) {
         let before = self.anchor.and_then(|anchor| self.pose_by(&anchor));
         let old_unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
-        let kept: BTreeMap<u64, &Arc<Observation>> =
-            self.waiting.iter().map(|w| (w.seen.seq, &w.seen)).collect();
+        let kept = self.waiting.iter();
+        let kept: BTreeMap<u64, &Arc<Observation>> = kept
+            .filter_map(|w| Some((w.seq, w.seen.as_ref()?)))
+            .collect();
         let seen_before = |seq: u64| kept.get(&seq).map(|seen| Arc::clone(seen));
         self.landmarks.update(views, &seen_before, &self.params);
         self.keyframes = views
@@ -206,7 +252,7 @@ impl Tracker {
         let newest = held.map(|held| held.seen.stamp).max();
         let mut done = 0;
         while done < n {
-            let is_reached = |w: &Waiting| newest.is_some_and(|newest| w.seen.stamp <= newest);
+            let is_reached = |w: &Waiting| newest.is_some_and(|newest| w.stamp <= newest);
             if !self.waiting.front().is_some_and(is_reached) {
                 break;
             }
@@ -273,23 +319,44 @@ impl Tracker {
         }
     }
 
-    /// A frame where odometry says, among the keyframes as they stand now.
+    /// A frame where odometry says, among the keyframes as they stand now: from the last frame that was found by landmarks or from
+    /// the newest keyframe, whichever leaves the place more certain.
     fn linked(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
-        let mut linked = self.odometry.locate(seq)?;
-        linked.covariance += self.localizer().covariance_of_key(&linked);
-        let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
-        Some((linked, *world_from_key * linked.key_from_cam))
+        let by_key = || {
+            let mut linked = self.odometry.locate(seq)?;
+            linked.covariance += self.localizer().covariance_of_key(&linked);
+            let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
+            Some((linked, *world_from_key * linked.key_from_cam))
+        };
+        let by_frame = || {
+            let found = self.search.found.as_ref()?;
+            let motion = self.odometry.motion(found.seq, seq)?;
+            let world_from_cam = self.pose_by(&found.anchor)? * motion.earlier_from_later;
+            let (world_from_key, _) = self.keyframes.get(&found.anchor.keyframe_id)?;
+            let of_found = transported(&found.covariance, &motion.earlier_from_later.inverse());
+            let linked = LinkedPose {
+                keyframe_id: found.anchor.keyframe_id,
+                key_from_cam: world_from_key.inverse() * world_from_cam,
+                covariance: of_found + motion.covariance,
+                n_inliers: motion.n_inliers,
+            };
+            Some((linked, world_from_cam))
+        };
+        let both = [by_key(), by_frame()].into_iter().flatten();
+        both.min_by(|a, b| {
+            place_variance(&a.0.covariance).total_cmp(&place_variance(&b.0.covariance))
+        })
     }
 
     /// Whether odometry knows better than the landmarks where the camera is.
     fn is_surer(&self, linked: &LinkedPose, located: &Localized) -> bool {
-        let place = |covariance: &Matrix6<f64>| (0..3).map(|i| covariance[(i, i)]).sum::<f64>();
-        place(&linked.covariance) < place(&self.localizer().covariance(located))
+        let of_located = self.localizer().covariance(located);
+        place_variance(&linked.covariance) < place_variance(&of_located)
     }
 
     fn retry_frame(&mut self, waiting: &Waiting) {
         let frame = &self.history.frames[waiting.history_ix];
-        let id = self.keyframe_of(waiting.seen.seq);
+        let id = self.keyframe_of(waiting.seq);
         if id.is_none() && frame.is_fitted {
             return;
         }
@@ -300,11 +367,18 @@ impl Tracker {
                 key_from_cam: Rigid::IDENTITY,
                 unit: self.keyframes.get(&id).map_or(1.0, |(_, unit)| *unit),
             })
-        } else {
+        } else if let Some(seen) = &waiting.seen {
             let guess = frame.anchor.and_then(|anchor| self.pose_by(&anchor));
             self.localizer()
-                .find_again(&waiting.seen, guess)
+                .find_again(seen, guess)
                 .map(|located| self.anchor_of(&located))
+        } else {
+            let between = self.odometry.between_keyframes(waiting.seq);
+            between.map(|(keyframe_id, key_from_cam)| Anchor {
+                keyframe_id,
+                key_from_cam,
+                unit: self.keyframes.get(&keyframe_id).map_or(1.0, |k| k.1),
+            })
         };
         if let Some(anchor) = anchor {
             self.history.frames[waiting.history_ix].anchor = Some(anchor);
@@ -381,6 +455,10 @@ impl Tracker {
             .and_then(|a| self.landmarks.held.get(&a.keyframe_id));
         reference.map_or(1.0, crate::track::landmarks::StoredKeyframe::median_depth)
     }
+}
+
+fn place_variance(covariance: &Matrix6<f64>) -> f64 {
+    (0..3).map(|i| covariance[(i, i)]).sum()
 }
 
 fn rows(matrix: &Matrix6<f64>) -> Covariance {

@@ -4,13 +4,14 @@ use std::sync::Arc;
 
 use nalgebra::Matrix6;
 
-use super::{DESIGN_SHARE, LOOK_AHEAD, MAX_DESIGN, Tracker, rows};
+use super::{DESIGN_SHARE, FoundFrame, LOOK_AHEAD, MAX_DESIGN, Tracker, rows};
 use crate::track::anchor::Anchor;
 use crate::track::localize::Localized;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
 use crate::track::odometry_link::LinkedPose;
 use crate::visual_odometry::odometry::OdometryPose;
+use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
 use splat_types::transform::Rigid;
 
@@ -37,8 +38,13 @@ impl Tracker {
         let was_elsewhere = self.odometry.registered_in_map();
         let is_new = was_elsewhere || self.motion.is_none() && self.state == TrackState::Lost;
         let anchor = self.anchor_of(located);
+        self.search.found = Some(FoundFrame {
+            seq: seen.seq,
+            anchor,
+            covariance,
+        });
         let pose = (cam_from_world, covariance, located.n_inliers);
-        self.measured(seen, pose, anchor, has_jumped || is_new)
+        self.measured((seen.seq, seen.stamp), pose, anchor, has_jumped || is_new)
     }
 
     /// There is no map yet: the pose is in odometry's frame and unit.
@@ -61,14 +67,14 @@ impl Tracker {
             pose: Some(reported),
             n_inliers: pose.n_inliers,
         };
-        self.keep(seen, &tracked, Some(pose.segment));
+        self.keep(Some(seen), &tracked, Some(pose.segment));
         tracked
     }
 
-    /// No landmarks of the map were found, and odometry has gone on from a keyframe.
+    /// Odometry has gone on from a keyframe. Landmarks of the map were not found, not looked for, or know less.
     pub(super) fn carried(
         &mut self,
-        seen: &Observation,
+        frame: (u64, Stamp),
         linked: &LinkedPose,
         world_from_cam: &Rigid,
     ) -> TrackedFrame {
@@ -81,14 +87,14 @@ impl Tracker {
             linked.covariance,
             linked.n_inliers,
         );
-        self.measured(seen, pose, anchor, is_new)
+        self.measured(frame, pose, anchor, is_new)
     }
 
     /// A pose in the map: `cam_from_world`, its covariance and the observations that agree. `is_new`: it owes nothing to where
     /// the camera was before.
     fn measured(
         &mut self,
-        seen: &Observation,
+        (seq, stamp): (u64, Stamp),
         (cam_from_world, covariance, n_inliers): (Rigid, Matrix6<f64>, usize),
         anchor: Anchor,
         is_new: bool,
@@ -100,13 +106,13 @@ impl Tracker {
             TrackState::Tracking
         };
         let before = self.motion.take().filter(|_| !is_new);
-        let motion = Motion::on(before.as_ref(), seen.stamp, cam_from_world, covariance);
+        let motion = Motion::on(before.as_ref(), stamp, cam_from_world, covariance);
         self.motion = Some(motion);
         self.anchor = Some(anchor);
         self.search.n_failed = 0;
         TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
+            seq,
+            stamp,
             state: self.state,
             reason: None,
             pose: Some(TrackedPose {
