@@ -1,6 +1,7 @@
 //! `run` and `replay`: arguments -> a job, its progress on the terminal, its run directory.
 
 use std::io::IsTerminal;
+use std::mem::{Discriminant, discriminant};
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -10,11 +11,15 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::cli::{LocaliseArgs, ParamArgs, ReplayArgs, RunArgs, Usage, say};
 use crate::eval::lpips;
 use crate::node::engines::Engines;
-use crate::node::job::{self, Job, Outcome, Progress, linger};
+use crate::node::job::{self, Activity, Job, Outcome, Progress, linger};
 use crate::node::stop::Stop;
 use crate::node::{localise, open_source, pipeline, ros2, run_dir};
 use crate::params::error::ParamsError;
 use crate::params::settings::Settings;
+use splat_types::time::Stopwatch;
+
+/// Between lines of the log about one activity.
+const SECS_BETWEEN_LINES: f64 = 1.4;
 
 pub(crate) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
     let mut settings = settings(&args.params)?;
@@ -161,11 +166,15 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
         output,
         engines: Engines::default(),
     };
-    let bar = bar(is_terminal);
-    let outcome = pipeline::run(job, &mut |progress| show(&bar, progress));
-    bar.finish_and_clear();
-    let mut outcome = outcome?;
-    let summary = run_dir::finish(&mut outcome, settings, lpips, out, input)?;
+    let mut display = ProgressDisplay::new(is_terminal);
+    let mut on_progress = |progress| display.show(progress);
+    let finished = pipeline::run(job, &mut on_progress).and_then(|mut outcome| {
+        let place = (out, input);
+        let summary = run_dir::finish(&mut outcome, settings, lpips, place, &mut on_progress)?;
+        Ok((outcome, summary))
+    });
+    display.clear();
+    let (mut outcome, summary) = finished?;
     say(summary);
     linger(&mut outcome, params.publish.shutdown_delay, &stop);
     verdict(&outcome, input)
@@ -225,9 +234,12 @@ pub(crate) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {
         if stop.is_asked() {
+            if stop.ask_again() {
+                return;
+            }
             #[expect(
                 clippy::exit,
-                reason = "the second Ctrl-C ends at once, whatever the stages do"
+                reason = "another Ctrl-C ends at once, whatever the stages do"
             )]
             std::process::exit(130);
         }
@@ -236,28 +248,96 @@ pub(crate) fn stop_on_ctrl_c(stop: &Stop) -> anyhow::Result<()> {
     .context("cannot listen for Ctrl-C")
 }
 
-fn bar(is_terminal: bool) -> ProgressBar {
-    if !is_terminal {
-        return ProgressBar::hidden();
-    }
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} steps  {msg}  {elapsed}");
-    ProgressBar::new(0).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+/// A bar on a terminal; else lines of the log.
+struct ProgressDisplay {
+    bar: Option<ProgressBar>,
+    /// What the last line was about, and its age.
+    last: Option<(Discriminant<Activity>, Stopwatch)>,
 }
 
-fn show(bar: &ProgressBar, progress: Progress) {
-    let text = format!(
+impl ProgressDisplay {
+    fn new(is_terminal: bool) -> Self {
+        let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {msg}  {elapsed}");
+        let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+        Self {
+            bar: is_terminal.then(|| ProgressBar::new(0).with_style(style)),
+            last: None,
+        }
+    }
+
+    fn show(&mut self, progress: Progress) {
+        if let Some(bar) = &self.bar {
+            let (done, of, text) = on_bar(&progress);
+            bar.set_length(of.max(done));
+            bar.set_position(done);
+            bar.set_message(text);
+            return;
+        }
+        let kind = discriminant(&progress.activity);
+        let is_new = |(last, age): &(Discriminant<Activity>, Stopwatch)| {
+            *last != kind || age.secs() >= SECS_BETWEEN_LINES
+        };
+        if self.last.as_ref().is_none_or(is_new) {
+            self.last = Some((kind, Stopwatch::start()));
+            tracing::info!("{}", line(&progress));
+        }
+    }
+
+    fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn counts(progress: &Progress) -> String {
+    format!(
         "{} of {} keyframes, {} splats",
         progress.n_registered, progress.n_keyframes, progress.n_splats
-    );
-    if bar.is_hidden() {
-        tracing::info!(
-            "step {} of {}: {text}",
-            progress.n_steps,
-            progress.steps_planned
-        );
-    } else {
-        bar.set_length(progress.steps_planned.max(progress.n_steps));
-        bar.set_position(progress.n_steps);
-        bar.set_message(text);
+    )
+}
+
+/// How much of how much is done, and of what.
+fn on_bar(progress: &Progress) -> (u64, u64, String) {
+    let steps = progress.n_steps;
+    match progress.activity {
+        Activity::Mapping => {
+            let of = progress.steps_planned.unwrap_or(steps);
+            (steps, of, format!("steps  {}", counts(progress)))
+        }
+        Activity::Finishing { secs, of_secs } => {
+            let text = format!("s of finishing  {steps} steps, {}", counts(progress));
+            (secs as u64, of_secs as u64, text)
+        }
+        Activity::HeldOutPoses { done, of } => {
+            (done as u64, of as u64, "poses of held-out views".to_owned())
+        }
+        Activity::Saving => (steps, steps, "steps  the map is written".to_owned()),
+        Activity::Quality { done, of } => (
+            done as u64,
+            of as u64,
+            "views compared with the map".to_owned(),
+        ),
+    }
+}
+
+fn line(progress: &Progress) -> String {
+    let steps = progress.n_steps;
+    match (progress.activity, progress.steps_planned) {
+        (Activity::Mapping, Some(of)) => format!("step {steps} of {of}: {}", counts(progress)),
+        (Activity::Mapping, None) => format!("step {steps}: {}", counts(progress)),
+        (Activity::Finishing { secs, of_secs }, _) => {
+            format!(
+                "finishing, {secs:.0} of {of_secs:.0} s: step {steps}, {}",
+                counts(progress)
+            )
+        }
+        (Activity::HeldOutPoses { done, of }, _) => {
+            format!("finding poses of held-out views: {done} of {of}")
+        }
+        (Activity::Saving, _) => format!("step {steps} was the last one; writing the map"),
+        (Activity::Quality { done, of }, _) => {
+            format!("comparing the map with images: {done} of {of}")
+        }
     }
 }

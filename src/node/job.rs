@@ -50,14 +50,32 @@ impl std::fmt::Debug for Job {
     }
 }
 
+/// What a run is at.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Activity {
+    /// Frames come, or are gone through.
+    #[default]
+    Mapping,
+    /// Live: the last frame has come, and the map gets better for as long as `map.finish_secs` says.
+    Finishing { secs: f64, of_secs: f64 },
+    /// Views that were kept out of optimisation get their poses, with the splats frozen.
+    HeldOutPoses { done: usize, of: usize },
+    /// The map is written.
+    Saving,
+    /// What the map shows is compared with images.
+    Quality { done: usize, of: usize },
+}
+
 /// How far a run is: for progress bars and logs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {
+    pub activity: Activity,
     pub n_keyframes: usize,
     pub n_registered: usize,
     pub n_splats: usize,
     pub n_steps: u64,
-    pub steps_planned: u64,
+    /// `None`: nobody knows when the frames end.
+    pub steps_planned: Option<u64>,
     /// The map changes no more.
     pub has_ended: bool,
 }
@@ -120,6 +138,21 @@ impl Outcome {
     /// Keyframes of this run, without those of a saved map.
     pub fn own_poses(&self) -> &[KeyframePose] {
         self.map.own(&self.snapshot.poses)
+    }
+}
+
+impl Outcome {
+    /// As it stands at the end.
+    pub(crate) fn progress(&self) -> Progress {
+        Progress {
+            activity: Activity::Saving,
+            n_keyframes: self.input.n_selected,
+            n_registered: self.map.n_keyframes(),
+            n_splats: self.map.n_splats(),
+            n_steps: self.map.n_steps(),
+            steps_planned: None,
+            has_ended: true,
+        }
     }
 }
 

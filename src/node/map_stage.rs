@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use crate::node::autosave::Autosave;
 use crate::node::backpressure::Backpressure;
-use crate::node::job::{KeyframeLatency, Progress};
+use crate::node::job::{Activity, KeyframeLatency, Progress};
 use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
 use crate::node::requests::RequestHandler;
@@ -32,12 +32,17 @@ const MAX_STAMPS: usize = 10_000_000;
 const STEPS_AT_ONCE: u64 = 10;
 /// The same live, where a keyframe waits for them.
 const LIVE_STEPS_AT_ONCE: u64 = 1;
+/// The same after the last frame, between looks at whether they are to end.
+const FINISHING_STEPS_AT_ONCE: u64 = 2;
 /// Live: a step is made after so many seconds, even where poses have all processors busy: what is seen is to be shown.
 const MAX_SECS_WITHOUT_STEP: f64 = 0.2;
 /// Seconds that geometry gets to end after a stop.
 const SECS_AFTER_STOP: f64 = 0.7;
 /// Live: most steps that a keyframe is worth; the optimiser rests when the loss falls no more or all are spent.
 const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
+
+/// Takes a snapshot for everybody, or only word of how far the run is.
+pub(crate) type Publish<'a> = dyn FnMut(Option<Arc<Snapshot>>, Progress) + 'a;
 
 /// Frames -> batches.
 #[derive(Debug)]
@@ -181,7 +186,7 @@ impl MapStage {
         &mut self,
         batch: Option<&Batch>,
         geometry: &GeometryBatch,
-        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+        publish: &mut Publish<'_>,
     ) {
         let newest = batch
             .and_then(|b| b.keyframes.last())
@@ -209,6 +214,7 @@ impl MapStage {
         }
         self.figures.optimise_secs += watch.secs();
         self.report_counts();
+        publish(None, self.progress());
         if self.live.is_none() {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
@@ -223,11 +229,8 @@ impl MapStage {
     }
 
     /// Live: a few steps, if any are left to make. Returns whether some were made.
-    pub(crate) fn step_while_waiting(
-        &mut self,
-        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
-    ) -> bool {
-        if self.map.is_settled() {
+    pub(crate) fn step_while_waiting(&mut self, publish: &mut Publish<'_>) -> bool {
+        if self.map.is_settled() || self.map.n_splats() == 0 {
             return false;
         }
         if let Some(live) = &mut self.live {
@@ -240,18 +243,20 @@ impl MapStage {
         self.map.n_steps() > before
     }
 
-    /// The steps after the last keyframe, the poses of held-out views, and the last snapshot.
-    pub(crate) fn finish(
-        &mut self,
-        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
-    ) -> Arc<Snapshot> {
+    /// The steps after the last keyframe, the poses of held-out views, and the last snapshot. Live there are as many steps as
+    /// `map.finish_secs` has room for.
+    pub(crate) fn finish(&mut self, publish: &mut Publish<'_>) -> Arc<Snapshot> {
         let watch = Stopwatch::start();
-        let (first, last) = (self.map.n_steps(), self.params.train.steps);
-        let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
-        self.make_steps(last, &phase, publish);
+        if self.live.is_some() {
+            self.finish_live(publish);
+        } else {
+            let (first, last) = (self.map.n_steps(), self.params.train.steps);
+            let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
+            self.make_steps(last, &phase, publish);
+        }
         // Splats as they were seeded say less of a pose than the geometry that seeded them.
         if self.map.n_steps() > 0 && !self.recovery.stop.is_asked() {
-            self.on_map(Mapper::refine_held_out);
+            self.refine_held_out(publish);
         }
         self.figures.optimise_secs += watch.secs();
         // The last map file must not be overtaken by an older one.
@@ -261,11 +266,57 @@ impl MapStage {
         let snapshot = snapshot.unwrap_or_else(|| self.map.last_snapshot());
         self.report_counts();
         let last = Progress {
+            activity: Activity::Saving,
             has_ended: true,
             ..self.progress()
         };
         self.hand_over(Arc::clone(&snapshot), last, publish);
         snapshot
+    }
+
+    /// Steps for `map.finish_secs`, also after a stop; another one cuts them short.
+    fn finish_live(&mut self, publish: &mut Publish<'_>) {
+        let (watch, of_secs) = (Stopwatch::start(), self.params.map.finish_secs);
+        let stop = self.recovery.stop.clone();
+        stop.set_finishing(of_secs > 0.0);
+        while watch.secs() < of_secs && !stop.is_cut_short() {
+            // The end is known at last, so that rates can fall towards it.
+            let phase = Phase::Final((watch.secs() / of_secs) as f32);
+            if !self.make_steps_at_once(FINISHING_STEPS_AT_ONCE, phase) {
+                break;
+            }
+            let activity = Activity::Finishing {
+                secs: watch.secs(),
+                of_secs,
+            };
+            publish(
+                None,
+                Progress {
+                    activity,
+                    ..self.progress()
+                },
+            );
+            self.snapshot_if_due(publish);
+        }
+        stop.set_finishing(false);
+    }
+
+    /// As long as nobody asks to stop.
+    fn refine_held_out(&mut self, publish: &mut Publish<'_>) {
+        let (stop, progress) = (self.recovery.stop.clone(), self.progress());
+        self.on_map(|map| {
+            map.refine_held_out(&mut |done, of| {
+                let activity = Activity::HeldOutPoses { done, of };
+                publish(
+                    None,
+                    Progress {
+                        activity,
+                        ..progress
+                    },
+                );
+                !stop.is_asked()
+            })
+        });
     }
 
     /// Calls from outside and frames of the tracker, while nothing else is to be done.
@@ -338,7 +389,7 @@ impl MapStage {
         });
     }
 
-    fn step_until(&mut self, target: u64, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+    fn step_until(&mut self, target: u64, publish: &mut Publish<'_>) {
         let watch = Stopwatch::start();
         self.make_steps(target, &|_| Phase::Streaming, publish);
         self.figures.optimise_secs += watch.secs();
@@ -346,31 +397,33 @@ impl MapStage {
     }
 
     /// Steps up to `target`, as long as nobody asks to stop; `phase` of the steps made so far.
-    fn make_steps(
-        &mut self,
-        target: u64,
-        phase: &dyn Fn(u64) -> Phase,
-        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
-    ) {
+    fn make_steps(&mut self, target: u64, phase: &dyn Fn(u64) -> Phase, publish: &mut Publish<'_>) {
         while self.map.n_steps() < target && !self.recovery.stop.is_asked() {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
-            let phase = phase(self.map.n_steps());
-            let map = &mut self.map;
-            let made = match self.live.as_ref().and_then(|live| live.pool.as_ref()) {
-                Some(pool) => pool.install(|| map.step(n, phase)),
-                None => map.step(n, phase),
-            };
-            // After a fault the count of steps says how many are left.
-            if self.react(made) == Some(0) || self.recovery.error.is_some() {
+            if !self.make_steps_at_once(n, phase(self.map.n_steps())) {
                 break;
             }
-            let served = self.request_handler.serve(&mut self.map);
-            self.react(served);
             self.snapshot_if_due(publish);
         }
     }
 
-    pub(crate) fn snapshot_if_due(&mut self, publish: &mut dyn FnMut(Arc<Snapshot>, Progress)) {
+    /// Also serves calls from outside. `false`: there is nothing to train on, or mapping has ended.
+    fn make_steps_at_once(&mut self, n: u64, phase: Phase) -> bool {
+        let map = &mut self.map;
+        let made = match self.live.as_ref().and_then(|live| live.pool.as_ref()) {
+            Some(pool) => pool.install(|| map.step(n, phase)),
+            None => map.step(n, phase),
+        };
+        // After a fault the count of steps says how many are left.
+        if self.react(made) == Some(0) || self.recovery.error.is_some() {
+            return false;
+        }
+        let served = self.request_handler.serve(&mut self.map);
+        self.react(served);
+        true
+    }
+
+    pub(crate) fn snapshot_if_due(&mut self, publish: &mut Publish<'_>) {
         let is_due = self.since_snapshot.secs() >= self.params.map.snapshot_secs;
         if is_due
             && self.map.n_splats() > 0
@@ -386,14 +439,9 @@ impl MapStage {
     }
 
     /// The status counts the splats of what goes out: fewer than the engine's where some are not finite.
-    fn hand_over(
-        &self,
-        snapshot: Arc<Snapshot>,
-        progress: Progress,
-        publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
-    ) {
+    fn hand_over(&self, snapshot: Arc<Snapshot>, progress: Progress, publish: &mut Publish<'_>) {
         self.report(|status| status.n_splats = snapshot.splats.len() as u64);
-        publish(snapshot, progress);
+        publish(Some(snapshot), progress);
     }
 
     /// `None` once mapping has ended.
@@ -410,15 +458,12 @@ impl MapStage {
 
     fn progress(&self) -> Progress {
         Progress {
+            activity: Activity::Mapping,
             n_keyframes: self.figures.n_keyframes,
             n_registered: self.map.n_keyframes(),
             n_splats: self.map.n_splats(),
             n_steps: self.map.n_steps(),
-            steps_planned: if self.live.is_some() {
-                0
-            } else {
-                self.params.train.steps
-            },
+            steps_planned: self.live.is_none().then_some(self.params.train.steps),
             has_ended: false,
         }
     }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::node::backpressure::Backpressure;
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
-use crate::node::map_stage::{MapStage, SelectStage};
+use crate::node::map_stage::{MapStage, Publish, SelectStage};
 use crate::node::publish_threads::{
     LiveStage, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
 };
@@ -35,6 +35,8 @@ const EVENT_QUEUE: usize = 8;
 const CALL_TICK: Duration = Duration::from_millis(100);
 /// Live: time between looks of the map at whether poses of keyframes are still at work.
 const POSE_TICK: Duration = Duration::from_millis(4);
+/// How long a run says nothing at most.
+const PROGRESS_TICK: Duration = Duration::from_millis(1500);
 /// Live, while no keyframe comes: seconds between looks of the tracker at what steps have made of the poses.
 const UPDATE_SECS: f64 = 1.0;
 
@@ -146,8 +148,8 @@ impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
         let (mut live, mut snapshots) = (self.live, self.snapshots);
-        let mut publish = |snapshot: Arc<Snapshot>, progress: Progress| {
-            if let Some(stage) = &mut snapshots {
+        let mut publish = |snapshot: Option<Arc<Snapshot>>, progress: Progress| {
+            if let Some((stage, snapshot)) = snapshots.as_mut().zip(snapshot) {
                 stage.publish(&(snapshot, progress.has_ended), 0);
             }
             on_progress(progress);
@@ -252,10 +254,12 @@ impl Stages {
             run_geometry(self.geometry, &batches, &answers_tx, limit)
         })?;
         let map = spawn("map", move || {
-            let mut publish = |snapshot, progress: Progress| {
+            let mut publish = |snapshot: Option<Arc<Snapshot>>, progress: Progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
                 let is_last = progress.has_ended;
-                drop(snapshots_tx.send((snapshot, is_last)));
+                if let Some(snapshot) = snapshot {
+                    drop(snapshots_tx.send((snapshot, is_last)));
+                }
                 progress_tx.send(progress).ok();
             };
             let updates = (poses.as_deref(), updates_tx.as_ref());
@@ -263,9 +267,7 @@ impl Stages {
         })?;
         let publish = spawn("publish", move || run_publisher(self.snapshots, &snapshots))?;
 
-        while let Some(progress) = progress.recv() {
-            on_progress(progress);
-        }
+        report_progress(&progress, on_progress);
         let (map, snapshot, ending) = joined("map", map)?;
         let error = match ending {
             Ending::All => joined("geometry", geometry)?,
@@ -291,6 +293,19 @@ impl Stages {
             streams: joined_streams(live, publish),
             error: error.map(|e| format!("geometry: {e}")),
         })
+    }
+}
+
+/// Until the map has ended. Where nothing new is known for long, what was known is said again: silence looks like a fault.
+fn report_progress(progress: &Receiver<Progress>, on_progress: &mut dyn FnMut(Progress)) {
+    let mut last = Progress::default();
+    loop {
+        match progress.recv_timeout(PROGRESS_TICK) {
+            Received::Item(now) => last = now,
+            Received::Nothing => {}
+            Received::Ended => return,
+        }
+        on_progress(last);
     }
 }
 
@@ -356,7 +371,7 @@ fn run_map(
     mut stage: MapStage,
     (poses, updates): (Option<&Backpressure>, Option<&Sender<KeyframeUpdate>>),
     answers: &Receiver<Answer>,
-    publish: &mut dyn FnMut(Arc<Snapshot>, Progress),
+    publish: &mut Publish<'_>,
 ) -> (MapStage, Arc<Snapshot>, Ending) {
     let mut since_update = Stopwatch::start();
     if let Some(live) = &mut stage.live {

@@ -22,7 +22,7 @@ use crate::eval::report_json::{
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::machine::memory::peak_rss_mib;
-use crate::node::job::Outcome;
+use crate::node::job::{Activity, Outcome, Progress};
 use crate::node::save_map::{MapFile, SaveError, save_map};
 use crate::node::track_thread::TrackingSummary;
 use crate::params::settings::{Settings, defaults};
@@ -101,55 +101,68 @@ pub fn start_log(out: Option<&Path>, is_terminal: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures quality and writes the directory; returns what to show the user.
+/// Writes the directory and measures quality; returns what to show the user. The map and the poses are written first: what was
+/// gathered must not wait for figures.
 pub fn finish(
     outcome: &mut Outcome,
     settings: &Settings,
     lpips: Option<Lpips>,
-    out: Option<&Path>,
-    input: &str,
+    (out, input): (Option<&Path>, &str),
+    on_progress: &mut dyn FnMut(Progress),
 ) -> anyhow::Result<String> {
     let params = settings.params()?;
-    let (quality, comparisons) = match out {
-        Some(_) => measure_quality(outcome, params.map.holdout, lpips),
-        None => (Quality::default(), Vec::new()),
-    };
     let tracks = &outcome.tracking.tracks.frames;
     let keyframes = timed_keyframes(outcome);
     let rows = frames::rows(&keyframes, tracks, &outcome.input.frame_stamps);
+    let written = out.map_or(Ok(()), |out| write_map(outcome, (&keyframes, &rows), out));
+    let (quality, comparisons) = match out {
+        Some(_) => measure_quality(outcome, params.map.holdout, lpips, on_progress),
+        None => (Quality::default(), Vec::new()),
+    };
     let report = Report {
         tracking: tracking_figures(&outcome.tracking, &rows),
         ..report(outcome, settings, quality)
     };
-    if let Some(out) = out {
-        write(outcome, (&report, &rows), &comparisons, out, input)?;
-    }
+    let reported = out.map_or(Ok(()), |out| {
+        let poses = (&keyframes[..], &rows[..]);
+        write_report(outcome, (&report, &comparisons), poses, (out, input))
+    });
+    written.and(reported)?;
     Ok(summary(&report, out))
 }
 
-fn write(
+fn write_map(
     outcome: &mut Outcome,
-    (report, rows): (&Report, &[FrameRow]),
-    comparisons: &[Comparison],
+    (keyframes, rows): (&[TimedPose], &[FrameRow]),
     out: &Path,
-    input: &str,
 ) -> anyhow::Result<()> {
     let health = outcome.map.health();
     let landmarks = std::mem::take(&mut outcome.tracking.landmarks);
     let checkpoint = outcome.map.checkpoint(landmarks);
-    let snapshot = &outcome.snapshot;
-    let keyframes = timed_keyframes(outcome);
-    let frames = frames::trajectory(rows);
     let live = frames::live_trajectory(&outcome.tracking.tracks.frames);
-    let truth: Vec<TimedPose> = outcome
-        .input
-        .truth
-        .iter()
-        .map(|(stamp, pose)| TimedPose {
-            stamp: *stamp,
-            pose: *pose,
-        })
-        .collect();
+    let results: [anyhow::Result<()>; 7] = [
+        save(MapFile::Checkpoint(&checkpoint), &out.join("map.splatmap")),
+        save(MapFile::Ply(&outcome.snapshot.splats), &out.join("map.ply")),
+        write_tum(keyframes, &out.join("keyframes.tum")).map_err(Into::into),
+        write_health(&health, &out.join("keyframes.csv")).map_err(Into::into),
+        write_tum(&frames::trajectory(rows), &out.join("trajectory.tum")).map_err(Into::into),
+        write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
+        frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
+    ];
+    results.into_iter().collect()
+}
+
+fn write_report(
+    outcome: &Outcome,
+    (report, comparisons): (&Report, &[Comparison]),
+    (keyframes, rows): (&[TimedPose], &[FrameRow]),
+    (out, input): (&Path, &str),
+) -> anyhow::Result<()> {
+    let truth = outcome.input.truth.iter().map(|(stamp, pose)| TimedPose {
+        stamp: *stamp,
+        pose: *pose,
+    });
+    let truth: Vec<TimedPose> = truth.collect();
     let page = ReportInputs {
         title: input,
         report,
@@ -157,19 +170,11 @@ fn write(
         comparisons,
         loss: outcome.map.loss_curve(),
         psnr: &[],
-        keyframes: &keyframes,
-        trajectory: &frames,
+        keyframes,
+        trajectory: &frames::trajectory(rows),
         reference: &truth,
     };
-
-    let results: [anyhow::Result<()>; 9] = [
-        write_tum(&keyframes, &out.join("keyframes.tum")).map_err(Into::into),
-        write_health(&health, &out.join("keyframes.csv")).map_err(Into::into),
-        write_tum(&frames, &out.join("trajectory.tum")).map_err(Into::into),
-        write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
-        frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
-        save(MapFile::Ply(&snapshot.splats), &out.join("map.ply")),
-        save(MapFile::Checkpoint(&checkpoint), &out.join("map.splatmap")),
+    let results: [anyhow::Result<()>; 2] = [
         report.write(&out.join("report.json")).map_err(Into::into),
         write_html(&page, &out.join("report.html")).map_err(Into::into),
     ];
@@ -253,32 +258,13 @@ fn measure_quality(
     outcome: &mut Outcome,
     holdout_every: u32,
     mut lpips: Option<Lpips>,
+    on_progress: &mut dyn FnMut(Progress),
 ) -> (Quality, Vec<Comparison>) {
-    let ids = outcome.map.keyframe_ids();
-    let (held_out, train): (Vec<u32>, Vec<u32>) = {
-        let (held_out, train): (Vec<_>, Vec<_>) =
-            ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
-        (
-            held_out.into_iter().map(|k| k.0).collect(),
-            train.into_iter().map(|k| k.0).collect(),
-        )
-    };
-    let (most_held_out, most_train) = if outcome.was_stopped {
-        (MAX_VIEWS_STOPPED, MAX_VIEWS_STOPPED)
-    } else {
-        (usize::MAX, MAX_TRAIN_VIEWS)
-    };
-    let n_held_out = held_out.len();
-    let (held_out, train) = (
-        subsampled(held_out, most_held_out),
-        subsampled(train, most_train),
-    );
-    if held_out.len() < n_held_out {
-        let n = held_out.len();
-        tracing::info!("stopped: quality is that of {n} of {n_held_out} held-out views");
-    }
+    let (held_out, train) = measured_views(outcome);
     let mut images = Vec::new();
     let mut fault: Option<EngineError> = None;
+    let (mut done, of) = (0, held_out.len() + train.len());
+    let progress = outcome.progress();
     let mut measure = |ids: &[u32], is_held_out: bool, max_images: usize| {
         let image_stride = ids.len().div_ceil(max_images).max(1);
         let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
@@ -286,6 +272,12 @@ fn measure_quality(
             if fault.is_some() {
                 break;
             }
+            let activity = Activity::Quality { done, of };
+            on_progress(Progress {
+                activity,
+                ..progress
+            });
+            done += 1;
             let shown = outcome.map.render_keyframe(*id);
             let shown = shown.unwrap_or_else(|error| {
                 fault = Some(error);
@@ -331,6 +323,31 @@ fn measure_quality(
         lpips_holdout,
     };
     (quality, images)
+}
+
+/// Held-out views, and training views, that quality is measured by.
+fn measured_views(outcome: &Outcome) -> (Vec<u32>, Vec<u32>) {
+    let ids = outcome.map.keyframe_ids();
+    let (held_out, train): (Vec<u32>, Vec<u32>) = {
+        let (held_out, train): (Vec<_>, Vec<_>) =
+            ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
+        (
+            held_out.into_iter().map(|k| k.0).collect(),
+            train.into_iter().map(|k| k.0).collect(),
+        )
+    };
+    let (most_held_out, most_train) = if outcome.was_stopped {
+        (MAX_VIEWS_STOPPED, MAX_VIEWS_STOPPED)
+    } else {
+        (usize::MAX, MAX_TRAIN_VIEWS)
+    };
+    let n_held_out = held_out.len();
+    let held_out = subsampled(held_out, most_held_out);
+    if held_out.len() < n_held_out {
+        let n = held_out.len();
+        tracing::info!("stopped: quality is that of {n} of {n_held_out} held-out views");
+    }
+    (held_out, subsampled(train, most_train))
 }
 
 /// Evenly, at most so many.

@@ -5,16 +5,36 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use splat_types::time::Stopwatch;
 
-/// Asks the source to end; everything behind it then ends in order, without the final steps.
+/// Asks the source to end; everything behind it then ends in order, without the final steps of a replay. Live, the map may get
+/// better for `map.finish_secs` after that, which a second request cuts short.
 #[derive(Debug, Clone, Default)]
 pub struct Stop {
     is_asked: Arc<AtomicBool>,
     is_restarting: Arc<AtomicBool>,
+    is_finishing: Arc<AtomicBool>,
+    is_cut_short: Arc<AtomicBool>,
 }
 
 impl Stop {
     pub fn ask(&self) {
         self.is_asked.store(true, Ordering::Relaxed);
+    }
+
+    /// Asks once more: the map is saved as it is. `false`: there is nothing that this would cut short.
+    pub fn ask_again(&self) -> bool {
+        self.is_finishing.load(Ordering::Relaxed)
+            && !self.is_cut_short.swap(true, Ordering::Relaxed)
+    }
+
+    /// Whether the map is getting better after its last frame.
+    pub(crate) fn set_finishing(&self, is_finishing: bool) {
+        self.is_finishing.store(is_finishing, Ordering::Relaxed);
+    }
+
+    /// Whether the steps after the last frame are to end. Nobody has a use for them where a fresh map begins.
+    pub(crate) fn is_cut_short(&self) -> bool {
+        let is_set = |flag: &AtomicBool| flag.load(Ordering::Relaxed);
+        is_set(&self.is_cut_short) || is_set(&self.is_restarting)
     }
 
     /// For sources, which know no nodes.

@@ -133,7 +133,14 @@ fn job(params: Params, engines: Engines, out: &Path) -> Job {
 fn run(settings: &Settings, engines: Engines, out: &Path) -> Outcome {
     let job = job(settings.params().unwrap(), engines, out);
     let mut outcome = pipeline::run(job, &mut |_| ()).unwrap();
-    run_dir::finish(&mut outcome, settings, None, Some(out), INPUT).unwrap();
+    run_dir::finish(
+        &mut outcome,
+        settings,
+        None,
+        (Some(out), INPUT),
+        &mut |_| {},
+    )
+    .unwrap();
     outcome
 }
 

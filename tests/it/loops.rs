@@ -314,7 +314,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<MapCorrection>
     for step in 0..60 {
         map.step(10, Phase::Final(step as f32 / 60.0)).unwrap();
     }
-    map.refine_held_out().unwrap();
+    map.refine_held_out(&mut |_, _| true).unwrap();
     let (mut seam, mut elsewhere) = (Vec::new(), Vec::new());
     let end = filmed.keyframes.len() as u32;
     for (id, _) in map

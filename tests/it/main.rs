@@ -31,6 +31,7 @@ mod images;
 mod joint;
 mod layers;
 mod lenses;
+mod live_end;
 mod localise;
 mod loops;
 mod lpips;

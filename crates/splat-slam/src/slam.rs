@@ -160,7 +160,7 @@ impl Slam {
             }
         }
         if self.mapper.n_steps() > 0 {
-            self.mapper.refine_held_out()?;
+            self.mapper.refine_held_out(&mut |_, _| true)?;
         }
         self.update_tracker()?;
         self.take_correction(&mut events);

@@ -46,6 +46,9 @@ pub struct MapParams {
     /// Wall time between snapshots for publishers.
     #[schemars(range(min = 0.05, max = 3600.0), extend("unit" = "s"))]
     pub snapshot_secs: f64,
+    /// Live: how long the map gets better after the last frame before it is saved; another stop cuts it short.
+    #[schemars(range(min = 0.0, max = 3600.0), extend("unit" = "s"))]
+    pub finish_secs: f64,
 }
 
 impl Default for MapParams {
@@ -60,6 +63,7 @@ impl Default for MapParams {
             autosave_secs: 0.0,
             holdout: 8,
             snapshot_secs: 2.0,
+            finish_secs: 0.0,
         }
     }
 }

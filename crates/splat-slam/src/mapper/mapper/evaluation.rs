@@ -15,11 +15,19 @@ use splat_types::rendering::Rendering;
 use splat_types::transform::Rigid;
 
 impl Mapper {
-    /// Moves each held-out view, alone and with the splats frozen, to where its image fits best.
-    pub fn refine_held_out(&mut self) -> Result<(), EngineError> {
+    /// Moves each held-out view, alone and with the splats frozen, to where its image fits best; `goes_on` is asked before each,
+    /// with how many are done and of how many.
+    pub fn refine_held_out(
+        &mut self,
+        goes_on: &mut dyn FnMut(usize, usize) -> bool,
+    ) -> Result<(), EngineError> {
         self.trainer.record_loss(&mut *self.engine)?;
         register_held_out(&mut self.split().0)?;
-        for id in self.held_out() {
+        let held_out = self.held_out();
+        for (done, id) in held_out.iter().copied().enumerate() {
+            if !goes_on(done, held_out.len()) {
+                break;
+            }
             let was_here = self.keyframes.is_resident(id);
             if !self.with_resident(id)? {
                 continue;
