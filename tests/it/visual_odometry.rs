@@ -3,11 +3,15 @@
 
 use std::collections::BTreeMap;
 
+use glam::{DQuat, DVec3};
+
+use crate::scenes::scene;
 use splat_geometry::similarity;
 use splat_mapper::node::open_source;
 use splat_mapper::params::settings::Settings;
 use splat_slam::visual_odometry::odometry::{OdometryFrame, OdometryState, VisualOdometry};
 use splat_slam::working_camera::WorkingCamera;
+use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
 use splat_types::transform::{Rigid, extent};
 
@@ -78,11 +82,36 @@ fn a_walk_through_a_room_is_followed_from_the_first_parallax_on() {
     );
 }
 
+/// The same place, by a camera that was turned half about its axis.
+fn upside_down(frame: &Frame) -> Frame {
+    let mut image = (*frame.image).clone();
+    image.pixels = image
+        .pixels
+        .chunks_exact(3)
+        .rev()
+        .flatten()
+        .copied()
+        .collect();
+    let turned = |i: Intrinsics| Intrinsics {
+        cx: f64::from(i.width_px) - i.cx,
+        cy: f64::from(i.height_px) - i.cy,
+        ..i
+    };
+    let half_turn = Rigid::new(DQuat::from_rotation_z(std::f64::consts::PI), DVec3::ZERO);
+    Frame {
+        image: image.into(),
+        intrinsics: frame.intrinsics.map(turned),
+        truth: frame.truth.map(|truth| truth * half_turn),
+        ..frame.clone()
+    }
+}
+
 #[test]
 fn after_a_jump_another_segment_begins() {
     let all = frames("synthetic:room?frames=120&width=320&height=240");
-    // The camera is lifted from one place of its way to another.
-    let frames: Vec<Frame> = all[..40].iter().chain(&all[80..]).cloned().collect();
+    // The camera is lifted from one place of its way and put down at another, upside down.
+    let rest = all[80..].iter().map(upside_down);
+    let frames: Vec<Frame> = all[..40].iter().cloned().chain(rest).collect();
     let found = odometry_of(&frames);
     let errors = errors(&frames, &found);
     assert!(errors.len() >= 2, "{errors:?}");
@@ -116,4 +145,34 @@ fn a_standing_camera_and_a_blank_wall_have_no_pose_and_the_reason() {
     uncalibrated.intrinsics = None;
     let found = odometry_of(&[uncalibrated]);
     assert_eq!(found[0].state, OdometryState::NoCamera);
+}
+
+#[test]
+fn dim_stripes_that_pass_quickly_are_followed() {
+    // Windows on stripes are nearly flat, and repeat; many are dark.
+    let frames = frames("synthetic:endless?frames=90&width=640&height=480&step=0.033");
+    let found = odometry_of(&frames);
+    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
+    assert!(first <= 15, "begins with frame {first}");
+    let errors = errors(&frames, &found);
+    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
+    let (n, error) = errors[&1];
+    assert!(100 * n >= 95 * (frames.len() - first), "{n} poses");
+    assert!(error < 0.05, "{:.2} % of the path's extent", 100.0 * error);
+}
+
+#[test]
+fn a_drive_of_a_car_is_followed_in_wide_images() {
+    let Some(folder) = scene("kitti_vo1") else {
+        return;
+    };
+    let frames = frames(&format!("images:{}", folder.display()));
+    let found = odometry_of(&frames);
+    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
+    assert!(first <= 6, "begins with frame {first}");
+    let errors = errors(&frames, &found);
+    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
+    let (n, error) = errors[&1];
+    assert_eq!(n, frames.len() - first, "each frame has a pose");
+    assert!(error < 0.05, "{:.2} % of the path's extent", 100.0 * error);
 }

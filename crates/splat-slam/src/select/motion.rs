@@ -25,10 +25,21 @@ pub(crate) fn small_grey(image: &RgbImage) -> GreyImage {
 
 /// Grey 0..1, its longer side divided by a whole number so that it is at most `max_side_px`.
 pub(crate) fn grey_of_side(image: &RgbImage, max_side_px: u32) -> GreyImage {
+    let longest = image.width_px.max(image.height_px);
+    grey_divided(image, longest.div_ceil(max_side_px) as usize)
+}
+
+/// The same, with sides divided so that there are at most `max_px` pixels: a wide image keeps its detail.
+pub(crate) fn grey_of_size(image: &RgbImage, max_px: usize) -> GreyImage {
     let (width, height) = (image.width_px as usize, image.height_px as usize);
-    let factor = (image.width_px.max(image.height_px))
-        .div_ceil(max_side_px)
-        .max(1) as usize;
+    let is_small = |factor: &usize| (width / factor) * (height / factor) <= max_px;
+    grey_divided(image, (1..).find(is_small).unwrap_or(1))
+}
+
+/// Means of squares of `factor` pixels a side, at least 1.
+fn grey_divided(image: &RgbImage, factor: usize) -> GreyImage {
+    let (width, height) = (image.width_px as usize, image.height_px as usize);
+    let factor = factor.max(1);
     let (small_width, small_height) = ((width / factor).max(1), (height / factor).max(1));
     let norm = 1.0 / (255.0 * 4.0 * (factor * factor) as f32);
     let mut grey = Vec::with_capacity(small_width * small_height);

@@ -13,8 +13,6 @@ const LANES: usize = 8;
 const LANE_COLUMNS: usize = WINDOW - WINDOW % LANES;
 const N_PIXELS: usize = WINDOW * WINDOW;
 const PATCH: usize = WINDOW + 1;
-/// Per pixel of the window, the smaller eigenvalue of the structure tensor below which a point has no definite place.
-const MIN_EIGENVALUE: f32 = 1e-4;
 /// A structure tensor of a smaller determinant is not inverted.
 const MIN_DETERMINANT: f32 = 1e-7;
 
@@ -61,8 +59,9 @@ impl Window {
         window
     }
 
-    /// `None` where the window has too little structure to be followed.
-    pub(crate) fn inverse_tensor(&self) -> Option<Inverse> {
+    /// `None` where the window has too little structure to be followed: the smaller eigenvalue of its tensor, per pixel, is
+    /// below `min_eigenvalue`.
+    pub(crate) fn inverse_tensor(&self, min_eigenvalue: f32) -> Option<Inverse> {
         let [a, b, c] = self.tensor;
         let determinant = a * c - b * b;
         if determinant.abs() < MIN_DETERMINANT {
@@ -70,7 +69,7 @@ impl Window {
         }
         let spread = a - c;
         let smaller = (a + c - (spread * spread + 4.0 * b * b).sqrt()) * 0.5;
-        if smaller / (N_PIXELS as f32) < MIN_EIGENVALUE {
+        if smaller / (N_PIXELS as f32) < min_eigenvalue {
             return None;
         }
         Some(Inverse {

@@ -4,13 +4,16 @@ use std::collections::BTreeSet;
 
 use crate::select::grey::GreyImage;
 use crate::select::motion::corners_in_cells;
-use crate::select::optical_flow::{Found, Pyramid, optical_flow_near};
+use crate::select::optical_flow::{Found, Pyramid, optical_flow_far, optical_flow_near};
 
-/// Cells along the longer side; each has one new corner where it has none.
-const CELLS_ALONG: usize = 26;
+/// Cells of an image, about; each has one new corner where it has none.
+const N_CELLS: usize = 500;
 /// Smaller eigenvalue of the structure tensor from which a place at half size is a corner: there, sensor noise of two levels gives
 /// 6e-4.
 const MIN_RESPONSE: f32 = 1.5e-3;
+/// The same where fewer than a share of the cells have a corner, as in the dark: some will be noise, and are given up soon.
+const MIN_WEAK_RESPONSE: f32 = 5e-4;
+const FEW_CORNERS: usize = N_CELLS / 4;
 /// Least longer side of the coarsest level, on which windows still lie inside.
 const COARSEST_PX: usize = 80;
 /// Mean absolute difference of the windows, grey 0..1, above which a corner has slipped.
@@ -56,16 +59,26 @@ impl FeatureTracks {
         };
         let inside = |p: [f32; 2]| is_inside(next.image(), p);
         let near = |track: &FeatureTrack| (track.pixel, expected(track).filter(|p| inside(*p)));
-        let mut points: Vec<_> = self.tracks.iter().map(near).collect();
+        let points: Vec<_> = self.tracks.iter().map(near).collect();
         let is_good = |found: &Option<Found>| {
             found.is_some_and(|found| found.error < MAX_ERROR && inside(found.at))
         };
+        let is_enough = |found: &[Option<Found>]| {
+            let n_good = found.iter().filter(|found| is_good(found)).count();
+            n_good as f64 >= MIN_AS_EXPECTED * points.len() as f64
+        };
         let mut found = optical_flow_near(&last, &next, &points);
-        let n_good = found.iter().filter(|found| is_good(found)).count();
-        if (n_good as f64) < MIN_AS_EXPECTED * points.len() as f64 {
-            // The camera has not gone on as it went: all are looked for from where they were.
-            points.iter_mut().for_each(|(_, near)| *near = None);
-            found = optical_flow_near(&last, &next, &points);
+        if !is_enough(&found) {
+            // The camera has not gone on as it went: all are looked for from where they were, by what is coarse, for far
+            // motion, and by what is fine, since repeated patterns mislead where they are small; then farther than windows reach.
+            let places: Vec<[f32; 2]> = points.iter().map(|(at, _)| *at).collect();
+            let anywhere: Vec<_> = places.iter().map(|at| (*at, None)).collect();
+            let at_rest: Vec<_> = places.iter().map(|at| (*at, Some(*at))).collect();
+            keep_better(&mut found, optical_flow_near(&last, &next, &anywhere));
+            keep_better(&mut found, optical_flow_near(&last, &next, &at_rest));
+            if !is_enough(&found) {
+                keep_better(&mut found, optical_flow_far(&last, &next, &places));
+            }
         }
         let followed = self.tracks.iter().zip(found);
         let followed = followed.filter(|(_, found)| is_good(found));
@@ -81,6 +94,13 @@ impl FeatureTracks {
 
     /// New corners of the newest image in cells that have none.
     pub(crate) fn refill(&mut self) {
+        self.refill_from(MIN_RESPONSE);
+        if self.tracks.len() < FEW_CORNERS {
+            self.refill_from(MIN_WEAK_RESPONSE);
+        }
+    }
+
+    fn refill_from(&mut self, min_response: f32) {
         let Some(newest) = &self.newest else {
             return;
         };
@@ -93,7 +113,7 @@ impl FeatureTracks {
         let cell = |p: [f32; 2]| p.map(|v| v.max(0.0) as usize / cell_px);
         let taken: BTreeSet<[usize; 2]> = self.tracks.iter().map(|t| cell(t.pixel)).collect();
         let is_free = |cell: [usize; 2]| !taken.contains(&cell);
-        for pixel in corners_in_cells(image, cell_px / scale, MIN_RESPONSE, is_free) {
+        for pixel in corners_in_cells(image, cell_px / scale, min_response, is_free) {
             let pixel = pixel.map(|v| v * scale as f32);
             if !is_inside(newest.image(), pixel) {
                 continue;
@@ -119,6 +139,16 @@ impl FeatureTracks {
     }
 }
 
+/// Of two places of each corner, where it looks more alike.
+fn keep_better(found: &mut [Option<Found>], others: Vec<Option<Found>>) {
+    let error = |found: &Option<Found>| found.map_or(f32::INFINITY, |found| found.error);
+    for (found, other) in found.iter_mut().zip(others) {
+        if error(&other) < error(found) {
+            *found = other;
+        }
+    }
+}
+
 /// Whether a corner is far enough from the border to be followed.
 fn is_inside(image: &GreyImage, pixel: [f32; 2]) -> bool {
     let is_between = |at: f32, side: usize| at >= BORDER_PX && at < side as f32 - BORDER_PX;
@@ -126,7 +156,8 @@ fn is_inside(image: &GreyImage, pixel: [f32; 2]) -> bool {
 }
 
 fn cell_px(grey: &GreyImage) -> usize {
-    grey.width.max(grey.height).div_ceil(2 * CELLS_ALONG).max(4) * 2
+    let side = ((grey.width * grey.height) as f64 / N_CELLS as f64).sqrt();
+    ((side / 2.0).round() as usize).max(4) * 2
 }
 
 #[cfg(test)]
