@@ -18,7 +18,7 @@ use splat_ros::reports::Reports;
 use splat_ros::status::{MapStatus, SelectStatus};
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::params::MapperParams;
-use splat_slam::mapper::train::schedule::{self, Phase};
+use splat_slam::mapper::train::schedule::{self, End};
 use splat_slam::select::selector::{Batcher, Selector};
 use splat_slam::track::landmarks::KeyframeView;
 use splat_types::frame::{Batch, Frame};
@@ -251,8 +251,8 @@ impl MapStage {
             self.finish_live(publish);
         } else {
             let (first, last) = (self.map.n_steps(), self.params.train.steps);
-            let phase = |n_steps| Phase::Final((n_steps - first) as f32 / (last - first) as f32);
-            self.make_steps(last, &phase, publish);
+            let end = |n_steps| End::Nears((n_steps - first) as f32 / (last - first) as f32);
+            self.make_steps(last, &end, publish);
         }
         // Splats as they were seeded say less of a pose than the geometry that seeded them.
         if self.map.n_steps() > 0 && !self.recovery.stop.is_asked() {
@@ -281,8 +281,8 @@ impl MapStage {
         stop.set_finishing(of_secs > 0.0);
         while watch.secs() < of_secs && !stop.is_cut_short() {
             // The end is known at last, so that rates can fall towards it.
-            let phase = Phase::Final((watch.secs() / of_secs) as f32);
-            if !self.make_steps_at_once(FINISHING_STEPS_AT_ONCE, phase) {
+            let end = End::Nears((watch.secs() / of_secs) as f32);
+            if !self.make_steps_at_once(FINISHING_STEPS_AT_ONCE, end) {
                 break;
             }
             let activity = Activity::Finishing {
@@ -391,16 +391,16 @@ impl MapStage {
 
     fn step_until(&mut self, target: u64, publish: &mut Publish<'_>) {
         let watch = Stopwatch::start();
-        self.make_steps(target, &|_| Phase::Streaming, publish);
+        self.make_steps(target, &|_| End::Unknown, publish);
         self.figures.optimise_secs += watch.secs();
         self.snapshot_if_due(publish);
     }
 
-    /// Steps up to `target`, as long as nobody asks to stop; `phase` of the steps made so far.
-    fn make_steps(&mut self, target: u64, phase: &dyn Fn(u64) -> Phase, publish: &mut Publish<'_>) {
+    /// Steps up to `target`, as long as nobody asks to stop; `end` of the steps made so far.
+    fn make_steps(&mut self, target: u64, end: &dyn Fn(u64) -> End, publish: &mut Publish<'_>) {
         while self.map.n_steps() < target && !self.recovery.stop.is_asked() {
             let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
-            if !self.make_steps_at_once(n, phase(self.map.n_steps())) {
+            if !self.make_steps_at_once(n, end(self.map.n_steps())) {
                 break;
             }
             self.snapshot_if_due(publish);
@@ -408,11 +408,11 @@ impl MapStage {
     }
 
     /// Also serves calls from outside. `false`: there is nothing to train on, or mapping has ended.
-    fn make_steps_at_once(&mut self, n: u64, phase: Phase) -> bool {
+    fn make_steps_at_once(&mut self, n: u64, end: End) -> bool {
         let map = &mut self.map;
         let made = match self.live.as_ref().and_then(|live| live.pool.as_ref()) {
-            Some(pool) => pool.install(|| map.step(n, phase)),
-            None => map.step(n, phase),
+            Some(pool) => pool.install(|| map.step(n, end)),
+            None => map.step(n, end),
         };
         // After a fault the count of steps says how many are left.
         if self.react(made) == Some(0) || self.recovery.error.is_some() {

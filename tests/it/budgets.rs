@@ -14,7 +14,7 @@ use splat_mapper::params::settings::Settings;
 use splat_slam::mapper::map_file::checkpoint;
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::params::{MapParams, MapperParams, McmcParams, TrainParams};
-use splat_slam::mapper::train::schedule::Phase;
+use splat_slam::mapper::train::schedule::End;
 use splat_synth::endless::EndlessSource;
 use splat_types::frame::{Batch, Keyframe};
 use splat_types::snapshot::Scale;
@@ -104,7 +104,7 @@ impl Walk {
         self.batch_id += 1;
         let geometry = self.model.infer(&batch).unwrap();
         self.map.add(Some(&batch), &geometry, None).unwrap();
-        self.map.step(STEPS_PER_BATCH, Phase::Streaming).unwrap();
+        self.map.step(STEPS_PER_BATCH, End::Unknown).unwrap();
         true
     }
 

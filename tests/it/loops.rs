@@ -12,7 +12,7 @@ use splat_geometry::ground_truth::noise::{Noise, answer};
 use splat_geometry::sfm::estimator::Sfm;
 use splat_mapper::eval::alignment::align;
 use splat_slam::mapper::mapper::Mapper;
-use splat_slam::mapper::train::schedule::Phase;
+use splat_slam::mapper::train::schedule::End;
 use splat_synth::settings::SynthSettings;
 use splat_synth::take::Take;
 use splat_types::camera::Intrinsics;
@@ -303,7 +303,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<MapCorrection>
             keyframes,
         };
         map.add(Some(&batch), &geometry, None).unwrap();
-        map.step(30, Phase::Streaming).unwrap();
+        map.step(30, End::Unknown).unwrap();
         corrections.extend(map.take_correction());
     }
     let last = GeometryBatch {
@@ -312,7 +312,7 @@ fn mapped(filmed: &Filmed, align: &AlignParams) -> (f64, f64, Vec<MapCorrection>
     };
     map.add(None, &last, None).unwrap();
     for step in 0..60 {
-        map.step(10, Phase::Final(step as f32 / 60.0)).unwrap();
+        map.step(10, End::Nears(step as f32 / 60.0)).unwrap();
     }
     map.refine_held_out(&mut |_, _| true).unwrap();
     let (mut seam, mut elsewhere) = (Vec::new(), Vec::new());

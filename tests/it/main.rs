@@ -45,6 +45,8 @@ mod onnx_node;
 mod over_zenoh;
 mod photometric;
 mod pose_anchor;
+mod provisional_splats;
+
 mod publish;
 mod recordings;
 mod relocation;

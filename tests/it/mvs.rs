@@ -44,7 +44,7 @@ fn reported(shown: &Shown, changes: &[&str]) -> Given {
         for seen in batch.observations {
             let landmarks = seen.landmarks.iter();
             let landmarks = landmarks
-                .map(|(id, p)| (*id, DVec2::new(f64::from(p[0]), f64::from(p[1]))))
+                .map(|seen| (seen.id, DVec2::from(seen.pixel.map(f64::from))))
                 .collect();
             reported.observations.insert(seen.keyframe_id, landmarks);
         }

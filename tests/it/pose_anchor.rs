@@ -18,7 +18,7 @@ use splat_slam::mapper::params::{
     MapParams, MapperParams, McmcParams, PoseOptimization, TrainParams,
 };
 use splat_slam::mapper::splats::transform::Carry;
-use splat_slam::mapper::train::schedule::Phase;
+use splat_slam::mapper::train::schedule::End;
 use splat_types::frame::Frame;
 use splat_types::snapshot::{Scale, Snapshot};
 use splat_types::transform::Rigid;
@@ -128,12 +128,12 @@ fn what_wanders_together_is_moved_back_together() {
     });
     let (mut map, before) = map_of(engine, PoseOptimization::PerView, &[&[0, 1, 2, 3, 4]]);
     let before = &before[0];
-    map.step(ANCHOR_EVERY - 1, Phase::Streaming).unwrap();
+    map.step(ANCHOR_EVERY - 1, End::Unknown).unwrap();
     let wandered = map.snapshot().unwrap();
     let shift =
         wandered.poses[0].world_from_cam.translation - before.poses[0].world_from_cam.translation;
     assert!(shift.length() > 0.1, "the test moves nothing: {shift}");
-    map.step(1, Phase::Streaming).unwrap();
+    map.step(1, End::Unknown).unwrap();
     let after = map.snapshot().unwrap();
     assert_poses(&after, before);
     // Holes may have been filled behind the first.
@@ -154,7 +154,7 @@ fn a_view_that_jumps_goes_back_to_the_models_pose_and_a_refined_one_stays() {
             ..Pushes::default()
         });
         let (mut map, before) = map_of(engine, PoseOptimization::PerView, &[&[0, 1, 2, 3, 4]]);
-        map.step(ANCHOR_EVERY, Phase::Streaming).unwrap();
+        map.step(ANCHOR_EVERY, End::Unknown).unwrap();
         assert_eq!(map.n_put_back(), n_put_back, "{degrees} degrees");
         let moved = map.snapshot().unwrap().poses[2].world_from_cam;
         let angle = moved

@@ -81,8 +81,18 @@ pub struct PoseStd {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observations {
     pub keyframe_id: u32,
-    /// (number of the point, the same in all keyframes; pixel of the keyframe's image).
-    pub landmarks: Vec<(u32, [f32; 2])>,
+    pub landmarks: Vec<SeenLandmark>,
+}
+
+/// A landmark as one keyframe saw it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SeenLandmark {
+    /// The same for the same point in all keyframes.
+    pub id: u32,
+    /// In the keyframe's image, undistorted where its lens bends.
+    pub pixel: [f32; 2],
+    /// Along the camera's axis, in the unit of the pose that came with it.
+    pub depth: f32,
 }
 
 /// What a model says of one batch. Keyframes that cannot be registered are absent, never guessed; a model that keeps

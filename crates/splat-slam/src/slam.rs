@@ -5,7 +5,7 @@
 
 use crate::mapper::mapper::Mapper;
 use crate::mapper::params::MapperParams;
-use crate::mapper::train::schedule::{self, Phase};
+use crate::mapper::train::schedule::{self, End};
 use crate::select::params::SelectParams;
 use crate::select::selector::{Batcher, Selector};
 use crate::track::history::Tracks;
@@ -139,7 +139,7 @@ impl Slam {
     /// Makes up to `n` optimiser steps between frames. Returns how many were made: fewer only while there is nothing to
     /// train on.
     pub fn step(&mut self, n: u64) -> Result<u64, SlamError> {
-        Ok(self.mapper.step(n, Phase::Streaming)?)
+        Ok(self.mapper.step(n, End::Unknown)?)
     }
 
     /// Maps what is left, makes the steps that are left, and lets the map go.
@@ -155,7 +155,7 @@ impl Slam {
             let n_steps = self.mapper.n_steps();
             let share = (n_steps - first) as f32 / (last - first) as f32;
             let n = STEPS_AT_ONCE.min(last - n_steps);
-            if self.mapper.step(n, Phase::Final(share))? == 0 {
+            if self.mapper.step(n, End::Nears(share))? == 0 {
                 break;
             }
         }
@@ -197,7 +197,7 @@ impl Slam {
         self.take_correction(events);
         let due = schedule::due(&self.params.mapper, progress.unwrap_or(0.0));
         let n = due.saturating_sub(self.mapper.n_steps());
-        self.mapper.step(n, Phase::Streaming)?;
+        self.mapper.step(n, End::Unknown)?;
         Ok(())
     }
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-use crate::answer::{GeometryBatch, Observations, PoseStd, PoseUpdate, View};
+use crate::answer::{GeometryBatch, Observations, PoseStd, PoseUpdate, SeenLandmark, View};
 use crate::mvs::depth_stream::{DepthStream, SweepJob, SweptDepth};
 use crate::mvs::neighbours::depth_range;
 use crate::mvs::params::MvsParams;
@@ -253,11 +253,14 @@ fn undistorted(image: Arc<RgbImage>, view: &SparseView) -> Option<Arc<RgbImage>>
 }
 
 fn observations(view: &SparseView) -> Observations {
-    let landmarks = view.landmarks.iter();
+    let cam_from_submap = view.submap_from_cam.inverse();
+    let seen = view.landmarks.iter().map(|landmark| SeenLandmark {
+        id: landmark.landmark,
+        pixel: landmark.pixel.as_vec2().to_array(),
+        depth: cam_from_submap.transform_point(landmark.point_in_submap).z as f32,
+    });
     Observations {
         keyframe_id: view.keyframe_id,
-        landmarks: landmarks
-            .map(|l| (l.landmark, l.pixel.as_vec2().to_array()))
-            .collect(),
+        landmarks: seen.collect(),
     }
 }

@@ -31,14 +31,15 @@ use crate::mapper::parts::Parts;
 use crate::mapper::splats::store::SplatSet;
 use crate::mapper::submaps::pose_anchor::ANCHOR_EVERY;
 use crate::mapper::submaps::registry::Submaps;
-use crate::mapper::train::schedule::Phase;
+use crate::mapper::train::landmark_depth::landmark_depth;
+use crate::mapper::train::schedule::End;
 use crate::mapper::train::trainer::Trainer;
 use crate::track::landmarks::KeyframeView;
 use splat_engine::error::EngineError;
 use splat_engine::settings::PoseMode;
 use splat_engine::traits::Engine;
 use splat_engine::view::TrainingView;
-use splat_geometry::answer::{GeometryBatch, PoseStd, View};
+use splat_geometry::answer::{GeometryBatch, Observations, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::frame::Batch;
 use splat_types::snapshot::Scale;
@@ -124,7 +125,7 @@ impl Mapper {
         if update.has_moved {
             self.trainer.reset_convergence();
         }
-        self.place(update.joined, PoseStd::default())?;
+        self.place(update.joined, PoseStd::default(), &geometry.observations)?;
         let (parts, trainer) = self.split();
         trainer.record_observations(&parts, &geometry.observations);
         let mut own = self.submaps.sort(&geometry.views, &self.keyframes);
@@ -133,7 +134,7 @@ impl Mapper {
         } else {
             self.restart_from()?
         });
-        let fresh = self.place(own, geometry.pose_error)?;
+        let fresh = self.place(own, geometry.pose_error, &geometry.observations)?;
         self.enforce_budget(0)?;
         self.keyframes.subsample_old_depth(&mut *self.engine)?;
         let (mut parts, trainer) = self.split();
@@ -146,8 +147,8 @@ impl Mapper {
 
     /// One optimiser update per step, with seeding and removal at their intervals. Returns the steps made, which
     /// are fewer only when there is nothing to train on.
-    pub fn step(&mut self, n: u64, phase: Phase) -> Result<u64, EngineError> {
-        if phase != Phase::Streaming {
+    pub fn step(&mut self, n: u64, end: End) -> Result<u64, EngineError> {
+        if end != End::Unknown {
             self.splats.set_progress(None);
         }
         if self.submaps.waits_for_registration() {
@@ -155,13 +156,13 @@ impl Mapper {
         }
         for done in 0..n {
             let (mut parts, trainer) = self.split();
-            let Some(settings) = trainer.step(&mut parts, phase)? else {
+            let Some(settings) = trainer.step(&mut parts, end)? else {
                 return Ok(done);
             };
             let n_steps = trainer.n_steps();
-            let may_change = !matches!(phase, Phase::Final(share) if share > LAST_RESEED);
+            let may_change = !matches!(end, End::Nears(share) if share > LAST_RESEED);
             if may_change && n_steps.is_multiple_of(RESEED_EVERY) {
-                trainer.seed_and_mask(&mut parts, phase)?;
+                trainer.seed_and_mask(&mut parts, end)?;
             }
             trainer.record_loss_at_interval(parts.engine)?;
             if may_change && n_steps.is_multiple_of(PRUNE_EVERY) {
@@ -405,7 +406,37 @@ impl Mapper {
         let ids: Vec<u32> = fresh.chain(deepened).copied().collect();
         self.balance(ids.len() * self.params.train.seeds_per_keyframe)?;
         let (mut parts, trainer) = self.split();
+        for id in deepened {
+            parts.splats.take_provisional(*id, parts.engine)?;
+        }
         trainer.seed_each(&mut parts, &ids)?;
+        self.report_renumbered();
+        Ok(())
+    }
+
+    /// What keyframes without depth show is in the map at once, coarsely, from where their landmarks are.
+    fn seed_provisional(
+        &mut self,
+        fresh: &[u32],
+        world_per_unit: f64,
+        observations: &[Observations],
+    ) -> Result<(), EngineError> {
+        for seen in observations
+            .iter()
+            .filter(|seen| fresh.contains(&seen.keyframe_id))
+        {
+            let (mut parts, trainer) = self.split();
+            let registered = parts.keyframes.registered().get(&seen.keyframe_id);
+            let Some(registered) = registered.filter(|registered| registered.depth.width_px == 0)
+            else {
+                continue;
+            };
+            let image = &registered.keyframe.frame.image;
+            let size_px = [image.width_px, image.height_px];
+            if let Some(depth) = landmark_depth(&seen.landmarks, size_px, world_per_unit) {
+                trainer.seed_provisional(&mut parts, seen.keyframe_id, &depth)?;
+            }
+        }
         self.report_renumbered();
         Ok(())
     }
@@ -418,7 +449,12 @@ impl Mapper {
     }
 
     /// Gives views of the map's own submap their place, and seeds splats from them.
-    fn place(&mut self, views: Vec<View>, pose_error: PoseStd) -> Result<Vec<u32>, EngineError> {
+    fn place(
+        &mut self,
+        views: Vec<View>,
+        pose_error: PoseStd,
+        observations: &[Observations],
+    ) -> Result<Vec<u32>, EngineError> {
         if views.is_empty() {
             return Ok(Vec::new());
         }
@@ -444,6 +480,8 @@ impl Mapper {
                     .update_depth(&view, depth, max_side, &mut *self.engine)?
                 {
                     deepened.push(view.keyframe_id);
+                    let view_ix = self.keyframes.registered()[&view.keyframe_id].view_ix;
+                    self.trainer.renew(view_ix);
                 }
             } else if let Some(keyframe) = self.keyframes.take_waiting(view.keyframe_id) {
                 let (image, intrinsics) = training_image(&keyframe, &view, max_side);
@@ -487,6 +525,7 @@ impl Mapper {
         self.keyframes.measure_scene();
         self.splats.prune(&self.params, &mut *self.engine)?;
         self.seed_all(&fresh, &deepened)?;
+        self.seed_provisional(&fresh, world_from_submap.scale, observations)?;
         Ok(fresh)
     }
 }

@@ -117,7 +117,7 @@ pub struct TrainParams {
     /// Adam rate of the base colour; the bands above take a twentieth.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_sh: f32,
-    /// Updates of a splat before each further band of its colour is trained; 0 = by the share of the final steps.
+    /// Updates of a splat before each further band of its colour is trained; 0 = all from the first.
     #[schemars(range(min = 0, max = 1000000))]
     pub sh_interval: u32,
     /// Pose optimisation: per view, by a shared MLP (3R-GS) and per view, or none.

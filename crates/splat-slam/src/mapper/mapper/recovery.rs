@@ -44,6 +44,7 @@ impl Mapper {
             self.engine.set_update_counts(0, &good.update_counts)?;
         }
         self.upload_views(&good.cameras)?;
+        self.trainer.note_trained(self.engine.poses()?.len());
         let (mut parts, trainer) = self.split();
         trainer.match_views(&mut parts)?;
         self.choose_trainable()?;

@@ -91,6 +91,7 @@ impl Mapper {
         {
             self.keyframes.page_in(id, &mut *self.engine)?;
         }
+        self.trainer.note_trained(self.engine.poses()?.len());
         self.choose_trainable()?;
         self.set_anchor()?;
         self.keep_good()?;

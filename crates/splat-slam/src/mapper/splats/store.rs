@@ -4,6 +4,7 @@
 //! near them again. Views that look at a region on disk are not trained on: they would fill the hole.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -32,6 +33,9 @@ const MOST_WANTED: usize = 4;
 const N_SAMPLES: usize = 12;
 const MIN_SEEN: usize = 3;
 const SEEN_WITHIN: f64 = 6.0;
+
+/// Keyframes that splats stand in for at once; depth of more is not to be expected.
+const MAX_PROVISIONAL: usize = 64;
 
 /// Share of the cap that is open when the first frames come; all of it is at the end of the input.
 const FIRST_ROOM: f64 = 0.25;
@@ -78,6 +82,8 @@ pub(crate) struct SplatSet {
     n_resumed: usize,
     /// All ids are new, and no client knows them.
     is_renumbered: bool,
+    /// By keyframe, ids of splats that stand in until its depth comes.
+    provisional: BTreeMap<u32, Range<u32>>,
 }
 
 impl SplatSet {
@@ -127,9 +133,46 @@ impl SplatSet {
         Ok(())
     }
 
+    /// Adds splats of a keyframe that has no depth yet; `take_provisional` takes them away. Those of keyframes that have
+    /// waited for theirs the longest stay for good when there are too many.
+    pub(crate) fn append_provisional(
+        &mut self,
+        keyframe_id: u32,
+        splats: &Splats,
+        engine: &mut dyn Engine,
+    ) -> Result<(), EngineError> {
+        let first = self.ids.next();
+        self.append(splats, engine)?;
+        self.provisional.insert(keyframe_id, first..self.ids.next());
+        while self.provisional.len() > MAX_PROVISIONAL {
+            self.provisional.pop_first();
+        }
+        Ok(())
+    }
+
+    /// Takes away what stood in for the depth of a keyframe.
+    pub(crate) fn take_provisional(
+        &mut self,
+        keyframe_id: u32,
+        engine: &mut dyn Engine,
+    ) -> Result<(), EngineError> {
+        let Some(provisional) = self.provisional.remove(&keyframe_id) else {
+            return Ok(());
+        };
+        let ids = self.ids.all().iter();
+        let keep: Vec<bool> = ids.map(|id| !provisional.contains(id)).collect();
+        if keep.iter().any(|k| !k) {
+            self.retain(&keep, engine)?;
+        }
+        Ok(())
+    }
+
     /// After the engine added splats.
     pub(crate) fn number(&mut self, engine: &dyn Engine) {
-        self.is_renumbered |= self.ids.grow_to(engine.len());
+        if self.ids.grow_to(engine.len()) {
+            self.is_renumbered = true;
+            self.provisional.clear();
+        }
         self.note_peaks(engine);
     }
 

@@ -23,7 +23,8 @@ impl SeenLandmarks {
     /// Remembers what was seen; the newest word on a keyframe counts.
     pub(crate) fn record(&mut self, observations: &[Observations]) {
         for seen in observations {
-            let pixels = seen.landmarks.iter().copied().collect();
+            let landmarks = seen.landmarks.iter();
+            let pixels = landmarks.map(|seen| (seen.id, seen.pixel)).collect();
             self.by_keyframe.insert(seen.keyframe_id, pixels);
         }
     }

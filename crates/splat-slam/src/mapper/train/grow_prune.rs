@@ -1,5 +1,7 @@
 //! Splats come where a view shows holes or errors, and go, or move, when they have become transparent.
 
+use std::sync::Arc;
+
 use rand::Rng;
 
 use crate::mapper::params::RelocationRule;
@@ -10,29 +12,69 @@ use splat_engine::error::EngineError;
 use splat_engine::mcmc::Relocation;
 use splat_engine::settings::McmcSettings;
 use splat_types::camera::Intrinsics;
+use splat_types::depth::DepthMap;
 use splat_types::rendering::Rendering;
+use splat_types::splats::splats::Splats;
 use splat_types::transform::Rigid;
 
 /// MCMC moves take in splats that one of the last so many rounds through all views has seen; the rest of a large map
 /// is not under optimisation, and its splats are no measure of anything.
 const ACTIVE_ROUNDS: usize = 4;
 const MIN_ACTIVE_STEPS: usize = 500;
+/// Splats that stand in for depth are so many times fewer than those that depth seeds.
+const PROVISIONAL_PART: usize = 4;
 
+/// Splats where a keyframe's depth says that the map has a hole or is wrong.
 pub(crate) fn seed_from(
     map: &mut Parts<'_>,
     rng: &mut impl Rng,
     keyframe_id: u32,
     fills_gaps: bool,
 ) -> Result<(), EngineError> {
+    let registered = map.keyframes.registered().get(&keyframe_id);
+    let Some(depth) = registered.map(|registered| Arc::clone(&registered.depth)) else {
+        return Ok(());
+    };
+    let budget = map.params.train.seeds_per_keyframe;
+    let seeds = seeds(map, rng, (keyframe_id, &depth), fills_gaps, budget)?;
+    if !seeds.is_empty() {
+        map.splats.append(&seeds, map.engine)?;
+    }
+    Ok(())
+}
+
+/// Coarse splats that stand in until a keyframe's depth comes, from that of its landmarks.
+pub(crate) fn seed_provisional(
+    map: &mut Parts<'_>,
+    rng: &mut impl Rng,
+    keyframe_id: u32,
+    depth: &DepthMap,
+) -> Result<(), EngineError> {
+    let budget = (map.params.train.seeds_per_keyframe / PROVISIONAL_PART).max(1);
+    let seeds = seeds(map, rng, (keyframe_id, depth), true, budget)?;
+    if !seeds.is_empty() {
+        let engine = &mut *map.engine;
+        map.splats.append_provisional(keyframe_id, &seeds, engine)?;
+    }
+    Ok(())
+}
+
+fn seeds(
+    map: &mut Parts<'_>,
+    rng: &mut impl Rng,
+    (keyframe_id, depth): (u32, &DepthMap),
+    fills_gaps: bool,
+    budget: usize,
+) -> Result<Splats, EngineError> {
     let room = map
         .splats
         .cap(map.params, map.keyframes, map.engine)
         .saturating_sub(map.engine.len());
     if room == 0 {
-        return Ok(());
+        return Ok(Splats::default());
     }
     let Some(camera) = camera(map, keyframe_id)? else {
-        return Ok(());
+        return Ok(Splats::default());
     };
     let rendering = shown(map, &camera, 0)?;
     let Some(registered) = map
@@ -41,28 +83,20 @@ pub(crate) fn seed_from(
         .get(&keyframe_id)
         .filter(|p| !p.is_held_out)
     else {
-        return Ok(());
+        return Ok(Splats::default());
     };
     let view = SeedView {
         keyframe_id,
         image: &registered.image,
         intrinsics: &camera.0,
         world_from_cam: &camera.1.inverse(),
-        depth: &registered.depth,
+        depth,
         rendering: rendering.as_ref(),
         fills_gaps,
     };
-    let mut seeds = seed::seed(
-        &view,
-        map.params.train.seeds_per_keyframe,
-        map.params.train.sh_degree,
-        rng,
-    );
+    let mut seeds = seed::seed(&view, budget, map.params.train.sh_degree, rng);
     seeds.truncate(room);
-    if !seeds.is_empty() {
-        map.splats.append(&seeds, map.engine)?;
-    }
-    Ok(())
+    Ok(seeds)
 }
 
 /// Transparent splats move to where others are, and some are added (3DGS-MCMC).

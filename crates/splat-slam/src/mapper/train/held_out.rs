@@ -2,7 +2,7 @@
 
 use crate::mapper::params::MapperParams;
 use crate::mapper::parts::Parts;
-use crate::mapper::train::schedule::{self, Phase};
+use crate::mapper::train::schedule::{self, End};
 use splat_engine::error::EngineError;
 use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
@@ -45,7 +45,7 @@ pub(crate) fn pose_only(
         weights: LossWeights::default(),
         epipolar_weight: 0.0,
         noise: 0.0,
-        ..schedule::settings(params, scene_depth, pose_error, Phase::Final(1.0))
+        ..schedule::settings(params, scene_depth, pose_error, End::Nears(1.0))
     }
 }
 

@@ -10,6 +10,8 @@ pub(crate) mod held_out;
 
 pub mod photometric;
 
+pub(crate) mod landmark_depth;
+
 pub mod seed;
 
 mod convergence;

@@ -7,20 +7,20 @@ use rand_pcg::Pcg64Mcg;
 use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization};
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
-/// Share of the steps between arrivals that train on the newest views.
-const NEWEST_SHARE: f64 = 0.5;
+/// Steps that every view gets before any other has its turn: what was seen once is to be shown.
+const FIRST_STEPS: u32 = 2;
+/// Share of the other steps that train on the newest views.
+const NEWEST_SHARE: f64 = 0.1;
 /// Views that count as newest: about one batch.
 const N_NEWEST: usize = 8;
+/// Steps on a view after which its holes are filled where no depth was verified: others have shown by then what they know.
+const STEPS_BEFORE_FILLING: u32 = 4;
 /// Rates at the last step, as a share of those at the first.
 const FINAL_MEAN_RATE: f32 = 0.01;
 const FINAL_POSE_RATE: f32 = 0.03;
 const FINAL_DEPTH_WEIGHT: f32 = 0.1;
-/// Between arrivals poses move slowly: splats that have just been seeded would pull them about.
-const STREAMING_POSE_RATE: f32 = 0.2;
 /// First pose rate as a share of the standard deviation that the model states: a few steps of a view cover it.
 const RATE_OF_ERROR: f32 = 0.5;
-/// Bands above the base colour wait until the geometry has converged (3DGS trains them late).
-const SH_START: f32 = 0.3;
 /// Rate of the SH bands above the base, as a share of the base rate (3DGS).
 const SH_REST_RATE: f32 = 1.0 / 20.0;
 
@@ -30,15 +30,17 @@ pub struct Schedule {
     rng: Pcg64Mcg,
     /// Rest of the shuffled round through all views.
     round: Vec<usize>,
+    /// Steps on each view of the engine since it was new, or had new depth.
+    n_steps: Vec<u32>,
 }
 
-/// Where the run stands.
+/// What is known of the end of the steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Phase {
-    /// Keyframes may still come.
-    Streaming,
-    /// All keyframes are there; the share of the final steps that is done, 0 to 1.
-    Final(f32),
+pub enum End {
+    /// Nothing: keyframes may still come, and the map may be wanted at any moment.
+    Unknown,
+    /// It comes; the share of the way to it that is done, 0 to 1.
+    Nears(f32),
 }
 
 impl Schedule {
@@ -46,13 +48,54 @@ impl Schedule {
         Self {
             rng: Pcg64Mcg::seed_from_u64(seed ^ 0x5eed_0001),
             round: Vec::new(),
+            n_steps: Vec::new(),
         }
     }
 
     /// One of `trainable`, which is in order of arrival; `None` when it is empty.
-    pub fn next_view(&mut self, trainable: &[usize], phase: Phase) -> Option<usize> {
+    pub fn next_view(&mut self, trainable: &[usize], end: End) -> Option<usize> {
+        let view_ix = self.draw(trainable, end)?;
+        if self.n_steps.len() <= view_ix {
+            self.n_steps.resize(view_ix + 1, 0);
+        }
+        self.n_steps[view_ix] = self.n_steps[view_ix].saturating_add(1);
+        Some(view_ix)
+    }
+
+    /// Steps on a view so far.
+    pub fn steps_of(&self, view_ix: usize) -> u32 {
+        self.n_steps.get(view_ix).copied().unwrap_or(0)
+    }
+
+    /// Whether depth that nobody verified may be guessed where a view has a hole.
+    pub fn may_fill(&self, view_ix: usize, end: End) -> bool {
+        end != End::Unknown || self.steps_of(view_ix) >= STEPS_BEFORE_FILLING
+    }
+
+    /// A view is as good as new: it has depth that it had not.
+    pub fn renew(&mut self, view_ix: usize) {
+        if let Some(n_steps) = self.n_steps.get_mut(view_ix) {
+            *n_steps = 0;
+        }
+    }
+
+    /// The engine's first `n_views` views are not new, and there are no others.
+    pub fn note_trained(&mut self, n_views: usize) {
+        self.n_steps = vec![FIRST_STEPS; n_views];
+    }
+
+    /// Views were removed: the round may name some that are gone.
+    pub fn restart_round(&mut self) {
+        self.round.clear();
+    }
+
+    fn draw(&mut self, trainable: &[usize], end: End) -> Option<usize> {
+        let mut newest_first = trainable.iter().rev().copied();
+        if let Some(new) = newest_first.find(|v| self.steps_of(*v) < FIRST_STEPS) {
+            return Some(new);
+        }
         let newest = trainable.len().saturating_sub(N_NEWEST);
-        if phase == Phase::Streaming && newest > 0 && self.rng.random_bool(NEWEST_SHARE) {
+        if end == End::Unknown && newest > 0 && self.rng.random_bool(NEWEST_SHARE) {
             return Some(trainable[self.rng.random_range(newest..trainable.len())]);
         }
         if self.round.is_empty() {
@@ -60,11 +103,6 @@ impl Schedule {
             self.round.shuffle(&mut self.rng);
         }
         self.round.pop()
-    }
-
-    /// Views were removed: the round may name some that are gone.
-    pub fn restart_round(&mut self) {
-        self.round.clear();
     }
 }
 
@@ -79,7 +117,7 @@ pub fn settings(
     params: &MapperParams,
     scene_depth: f32,
     pose_error: [f32; 2],
-    phase: Phase,
+    end: End,
 ) -> StepSettings {
     let raised = |rate: f32, error: f32| {
         if rate > 0.0 {
@@ -88,18 +126,11 @@ pub fn settings(
             0.0
         }
     };
-    let done = match phase {
-        Phase::Streaming => 0.0,
-        Phase::Final(share) => share.clamp(0.0, 1.0),
+    let done = match end {
+        End::Unknown => 0.0,
+        End::Nears(share) => share.clamp(0.0, 1.0),
     };
     let decayed = |rate: f32, last: f32| rate * last.powf(done);
-    let pose_share = if phase == Phase::Streaming {
-        STREAMING_POSE_RATE
-    } else {
-        1.0
-    };
-    // A splat's own age says when its bands start; else all wait together.
-    let sh_is_on = params.train.sh_interval > 0 || (phase != Phase::Streaming && done >= SH_START);
     let lr_mean = decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
     // Terms that have no say below have the weight of the parameters.
@@ -115,18 +146,16 @@ pub fn settings(
         lr_opacity: params.train.lr_opacity,
         lr_sh0: params.train.lr_sh,
         lr_sh_rest: params.train.lr_sh * SH_REST_RATE,
-        lr_pose_rotation: pose_share
-            * decayed(
-                raised(params.train.lr_rotation, pose_error[0]),
-                FINAL_POSE_RATE,
-            ),
-        lr_pose_translation: pose_share
-            * decayed(
-                raised(params.train.lr_translation * scene_depth, pose_error[1]),
-                FINAL_POSE_RATE,
-            ),
-        lr_pose_network: pose_share * decayed(params.train.lr_pose_network, FINAL_POSE_RATE),
-        lr_focal: pose_share * decayed(params.train.lr_focal, FINAL_POSE_RATE),
+        lr_pose_rotation: decayed(
+            raised(params.train.lr_rotation, pose_error[0]),
+            FINAL_POSE_RATE,
+        ),
+        lr_pose_translation: decayed(
+            raised(params.train.lr_translation * scene_depth, pose_error[1]),
+            FINAL_POSE_RATE,
+        ),
+        lr_pose_network: decayed(params.train.lr_pose_network, FINAL_POSE_RATE),
+        lr_focal: decayed(params.train.lr_focal, FINAL_POSE_RATE),
         lr_exposure: params.train.lr_exposure,
         ssim_weight: params.train.ssim_weight,
         weights,
@@ -137,7 +166,7 @@ pub fn settings(
         },
         epipolar_weight: params.train.epipolar_weight,
         noise: if_mcmc(lr_mean * params.mcmc.noise),
-        sh_degree: if sh_is_on { params.train.sh_degree } else { 0 },
+        sh_degree: params.train.sh_degree,
         sh_interval: params.train.sh_interval,
         train_splats: true,
         pose: pose_step(params),
@@ -162,29 +191,41 @@ mod tests {
     use splat_engine::loss_weights::LossWeights;
 
     #[test]
-    fn a_final_round_visits_every_view_once() {
+    fn a_round_near_the_end_visits_every_view_once() {
         let mut schedule = Schedule::new(7);
+        schedule.note_trained(20);
         let views: Vec<usize> = (3..20).collect();
         let mut drawn: Vec<usize> = views
             .iter()
-            .filter_map(|_| schedule.next_view(&views, Phase::Final(0.5)))
+            .filter_map(|_| schedule.next_view(&views, End::Nears(0.5)))
             .collect();
         drawn.sort_unstable();
         assert_eq!(drawn, views);
-        assert_eq!(schedule.next_view(&[], Phase::Final(0.9)), None);
+        assert_eq!(schedule.next_view(&[], End::Nears(0.9)), None);
     }
 
     #[test]
-    fn streaming_prefers_the_newest_views() {
+    fn new_views_come_first_then_all_in_rounds_and_the_newest_a_little_more_often() {
         let mut schedule = Schedule::new(7);
         let views: Vec<usize> = (0..80).collect();
+        let mut draw = |views: &[usize]| schedule.next_view(views, End::Unknown).unwrap();
+        let first: Vec<usize> = (0..160).map(|_| draw(&views)).collect();
+        assert_eq!(first[..3], [79, 79, 78]);
+        assert_eq!(first[159], 0);
         let draws = 1000;
-        let newest = (0..draws)
-            .filter_map(|_| schedule.next_view(&views, Phase::Streaming))
-            .filter(|v| *v >= 72)
-            .count();
-        // Half by preference, a tenth of the other half by chance.
-        assert!((480..620).contains(&newest), "{newest}");
+        let newest = (0..draws).filter(|_| draw(&views) >= 72).count();
+        // A tenth by preference, a tenth of the others by their turn.
+        assert!((150..230).contains(&newest), "{newest}");
+
+        let with_new: Vec<usize> = (0..81).collect();
+        assert_eq!([draw(&with_new), draw(&with_new)], [80, 80]);
+        schedule.renew(40);
+        assert_eq!(schedule.next_view(&with_new, End::Nears(0.9)), Some(40));
+        schedule.note_trained(81);
+        let after: Vec<usize> = (0..81)
+            .filter_map(|_| schedule.next_view(&with_new, End::Nears(0.9)))
+            .collect();
+        assert!(after.len() == 81 && after[..3] != [80, 80, 79]);
     }
 
     #[test]
@@ -196,17 +237,18 @@ mod tests {
             scale_reg: 0.0,
             ..LossWeights::all(2.0)
         };
-        let found = settings(&params, 2.0, [0.0; 2], Phase::Streaming);
+        let found = settings(&params, 2.0, [0.0; 2], End::Unknown);
         assert_eq!(found.weights, expected, "without mcmc.enabled");
     }
 
     #[test]
-    fn rates_decay_only_after_the_last_keyframe() {
+    fn rates_fall_only_towards_an_end_that_is_known() {
         let params = MapperParams::default();
-        let at = |phase| settings(&params, 2.0, [0.0; 2], phase);
-        assert_eq!(at(Phase::Streaming).lr_mean, at(Phase::Final(0.0)).lr_mean);
-        assert!((at(Phase::Final(1.0)).lr_mean / at(Phase::Streaming).lr_mean - 0.01).abs() < 1e-6);
-        assert_eq!(at(Phase::Streaming).sh_degree, 0);
-        assert_eq!(at(Phase::Final(1.0)).sh_degree, params.train.sh_degree);
+        let at = |end| settings(&params, 2.0, [0.0; 2], end);
+        let (open, last) = (at(End::Unknown), at(End::Nears(1.0)));
+        assert_eq!(open, at(End::Nears(0.0)), "one schedule");
+        assert!((last.lr_mean / open.lr_mean - 0.01).abs() < 1e-6);
+        assert!(last.weights.depth_weight < open.weights.depth_weight);
+        assert!(open.lr_pose_rotation > 0.0 && open.sh_degree == params.train.sh_degree);
     }
 }

@@ -9,12 +9,13 @@ use crate::mapper::train::correspondences::SeenLandmarks;
 use crate::mapper::train::grow_prune;
 use crate::mapper::train::loss_curve::LossCurve;
 use crate::mapper::train::photometric::{self, FrameFit};
-use crate::mapper::train::schedule::{self, Phase, Schedule};
+use crate::mapper::train::schedule::{self, End, Schedule};
 use splat_engine::error::EngineError;
 use splat_engine::settings::StepSettings;
 use splat_engine::traits::Engine;
 use splat_geometry::answer::Observations;
 use splat_types::camera::Intrinsics;
+use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
 
@@ -73,6 +74,16 @@ impl Trainer {
         self.trainable.push(view_ix);
     }
 
+    /// The engine's first `n_views` views have been trained on before: none of them is new.
+    pub(crate) fn note_trained(&mut self, n_views: usize) {
+        self.schedule.note_trained(n_views);
+    }
+
+    /// A view has depth that it had not: it is as good as new.
+    pub(crate) fn renew(&mut self, view_ix: usize) {
+        self.schedule.renew(view_ix);
+    }
+
     pub(crate) fn has_converged(&self) -> bool {
         self.convergence.is_over()
     }
@@ -106,13 +117,13 @@ impl Trainer {
     pub(crate) fn step(
         &mut self,
         map: &mut Parts<'_>,
-        phase: Phase,
+        end: End,
     ) -> Result<Option<StepSettings>, EngineError> {
-        let Some(view_ix) = self.schedule.next_view(&self.trainable, phase) else {
+        let Some(view_ix) = self.schedule.next_view(&self.trainable, end) else {
             return Ok(None);
         };
         let (scene_depth, pose_error) = (map.keyframes.scene_depth(), map.keyframes.pose_error());
-        let settings = schedule::settings(map.params, scene_depth, pose_error, phase);
+        let settings = schedule::settings(map.params, scene_depth, pose_error, end);
         map.engine.step(view_ix, &settings)?;
         self.n_steps += 1;
         Ok(Some(settings))
@@ -144,7 +155,7 @@ impl Trainer {
     pub(crate) fn seed_and_mask(
         &mut self,
         map: &mut Parts<'_>,
-        phase: Phase,
+        end: End,
     ) -> Result<(), EngineError> {
         if self.trainable.is_empty() {
             return Ok(());
@@ -156,7 +167,8 @@ impl Trainer {
             .map(|(id, _)| *id);
         if let Some(id) = id {
             grow_prune::mask_transients(map, id)?;
-            grow_prune::seed_from(map, &mut self.rng, id, phase != Phase::Streaming)?;
+            let fills_gaps = self.schedule.may_fill(view_ix, end);
+            grow_prune::seed_from(map, &mut self.rng, id, fills_gaps)?;
         }
         Ok(())
     }
@@ -168,6 +180,16 @@ impl Trainer {
     ) -> Result<(), EngineError> {
         ids.iter()
             .try_for_each(|id| grow_prune::seed_from(map, &mut self.rng, *id, false))
+    }
+
+    /// Splats for a keyframe without depth, from where its landmarks are.
+    pub(crate) fn seed_provisional(
+        &mut self,
+        map: &mut Parts<'_>,
+        keyframe_id: u32,
+        depth: &DepthMap,
+    ) -> Result<(), EngineError> {
+        grow_prune::seed_provisional(map, &mut self.rng, keyframe_id, depth)
     }
 
     pub(crate) fn relocate(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
