@@ -290,13 +290,13 @@ fn a_full_disk_ends_with_exit_1_and_leaves_no_half_files() {
     let output = Command::new("sh").args(["-c", &script]).output().unwrap();
     assert_eq!(output.status.code(), Some(1), "{}", last_line(&output));
     assert!(
-        last_line(&output).contains("map.ply"),
+        last_line(&output).contains("cannot write the map"),
         "{}",
         last_line(&output)
     );
     // What fits is there, what does not is not there by half.
     assert!(out.join("keyframes.tum").exists());
-    assert!(!out.join("map.ply").exists());
+    assert!(!out.join("map.splatmap").exists() && !out.join("map.ply").exists());
 }
 
 #[test]

@@ -13,6 +13,7 @@ use splat_slam::visual_odometry::odometry::{OdometryFrame, OdometryState, Visual
 use splat_slam::working_camera::WorkingCamera;
 use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
+use splat_types::time::Stamp;
 use splat_types::transform::{Rigid, extent};
 
 fn frames(scene: &str) -> Vec<Frame> {
@@ -175,4 +176,60 @@ fn a_drive_of_a_car_is_followed_in_wide_images() {
     let (n, error) = errors[&1];
     assert_eq!(n, frames.len() - first, "each frame has a pose");
     assert!(error < 0.05, "{:.2} % of the path's extent", 100.0 * error);
+}
+
+/// Poses of at least 95 % of the frames from the first one on, in one segment, off by less than 3 % of the path.
+fn assert_followed(what: &str, frames: &[Frame]) {
+    let found = odometry_of(frames);
+    let first = found.iter().position(|f| f.pose.is_some());
+    let first = first.unwrap_or_else(|| panic!("{what}: no frame has a pose"));
+    assert!(first <= 15, "{what}: begins with frame {first}");
+    let errors = errors(frames, &found);
+    assert_eq!(errors.len(), 1, "{what}: one segment: {errors:?}");
+    let (n, error) = errors[&1];
+    assert!(100 * n >= 95 * (frames.len() - first), "{what}: {n} poses");
+    assert!(error < 0.03, "{what}: {:.2} % of the path", 100.0 * error);
+}
+
+#[test]
+fn lost_frames_other_rates_and_a_frozen_image_do_not_end_a_segment() {
+    let all = frames("synthetic:room?frames=90&width=320&height=240");
+    let dropped = all.iter().filter(|f| f.seq * 7 % 10 >= 3);
+    let dropped: Vec<Frame> = dropped.cloned().collect();
+    assert_eq!(dropped.len(), 63);
+    assert_followed("30 % of the frames dropped", &dropped);
+    let half: Vec<Frame> = all.iter().step_by(2).cloned().collect();
+    assert_followed("half the rate", &half);
+
+    // The camera goes on sending its image of frame 40 for a second and a half, then what it sees from there.
+    let period = all[1].stamp.secs_since(all[0].stamp);
+    let later = |frame: &Frame, n: usize| Frame {
+        stamp: Stamp::from_secs(frame.stamp.secs() + n as f64 * period),
+        ..frame.clone()
+    };
+    let frozen = (0..15).map(|n| later(&all[40], n));
+    let frozen = all[..40].iter().cloned().chain(frozen);
+    let frozen: Vec<Frame> = frozen
+        .chain(all[41..].iter().map(|frame| later(frame, 14)))
+        .collect();
+    assert_followed("a frozen image", &frozen);
+}
+
+#[test]
+fn after_a_blackout_another_segment_begins_and_none_is_wrong() {
+    let mut frames = frames("synthetic:room?frames=90&width=320&height=240");
+    for frame in &mut frames[40..60] {
+        let mut dark = (*frame.image).clone();
+        dark.pixels.fill(3);
+        frame.image = dark.into();
+    }
+    let found = odometry_of(&frames);
+    assert!(
+        found[41..60].iter().all(|f| f.pose.is_none()),
+        "in the dark nothing is known"
+    );
+    assert!(found[70..].iter().all(|f| f.pose.is_some()), "light again");
+    for (segment, (n, error)) in &errors(&frames, &found) {
+        assert!(*n < 5 || *error < 0.03, "segment {segment}: {error}");
+    }
 }

@@ -90,11 +90,30 @@ fn settings_go_over_a_preset_and_a_preset_over_the_defaults() {
     );
 }
 
+/// Keys whose default is another one since version 0.1.0.
+const NEW_DEFAULTS: [&str; 6] = [
+    "map.snapshot_secs",
+    "mcmc.noise",
+    "train.lr_mean",
+    "train.lr_scale",
+    "train.lr_sh",
+    "train.sh_degree",
+];
+
 #[test]
 fn a_whole_file_of_version_0_1_0_reads_as_the_same_defaults() {
     let mut settings = Settings::shipped();
     let path = Path::new("src/params/params_0_1_0.yaml");
     settings.merge_file(path).unwrap();
+    for key in NEW_DEFAULTS {
+        let default = &defaults()[key];
+        assert_ne!(
+            settings.value(key),
+            Some(default),
+            "{key} is no new default"
+        );
+        settings.set(key, default.clone()).unwrap();
+    }
     for (key, value) in settings.entries() {
         let default = &defaults()[key];
         let same = value == default || value.as_f64().is_some_and(|v| Some(v) == default.as_f64());

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use glam::{DVec2, DVec3};
 
 use splat_geometry::stats::median;
-use splat_geometry::two_view::epipolar;
+use splat_geometry::two_view::epipolar::{self, homography_share};
 use splat_geometry::two_view::triangulate::{Observation, triangulate, widest_angle};
 use splat_types::camera::Intrinsics;
 use splat_types::transform::Rigid;
@@ -19,6 +19,8 @@ const MIN_SHARED: usize = 40;
 const MIN_SHARE: f64 = 0.7;
 /// Median angle between the rays of the points.
 const MIN_PARALLAX_DEG: f64 = 1.2;
+/// Share of the corners that one plane explains, above which two motions explain them nearly as well (Longuet-Higgins 1986).
+const MAX_PLANE_SHARE: f64 = 0.9;
 /// Of a single point.
 const MIN_ANGLE_RAD: f64 = 0.01;
 
@@ -35,7 +37,7 @@ pub(crate) struct TwoViewStart {
 pub(crate) enum NoStart {
     /// Too few corners of the first image are left: another one should take its place.
     Lost,
-    /// The camera has not moved, has only turned, or has not moved far enough.
+    /// The camera has not moved, has only turned, has not moved far enough, or sees one plane alone.
     NoParallax,
 }
 
@@ -62,6 +64,9 @@ pub(crate) fn start(
         || agree < MIN_SHARED
         || (agree as f64) < MIN_SHARE * seen.len() as f64
     {
+        return Err(NoStart::NoParallax);
+    }
+    if homography_share(&pairs, max_error_px, seed) > MAX_PLANE_SHARE {
         return Err(NoStart::NoParallax);
     }
     let poses = [Rigid::IDENTITY, motion.second_from_first];
@@ -112,12 +117,21 @@ mod tests {
     };
 
     fn seen(second_from_first: &Rigid, n: usize) -> Vec<(u32, DVec2, DVec2)> {
+        seen_between(second_from_first, n, 3.0..8.0)
+    }
+
+    /// Points at these depths.
+    fn seen_between(
+        second_from_first: &Rigid,
+        n: usize,
+        depths: std::ops::Range<f64>,
+    ) -> Vec<(u32, DVec2, DVec2)> {
         let mut rng = Pcg32::seed_from_u64(1);
         let one = |id: u32| {
             let x = DVec3::new(
                 rng.random_range(-2.0..2.0),
                 rng.random_range(-1.5..1.5),
-                rng.random_range(3.0..8.0),
+                rng.random_range(depths.clone()),
             );
             let mut noise = || DVec2::new(rng.random_range(-0.2..0.2), rng.random_range(-0.2..0.2));
             let first = CAMERA.project(x)? + noise();
@@ -139,12 +153,20 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_or_a_standing_camera_starts_nothing() {
+    fn a_turn_a_standing_camera_and_a_single_plane_start_nothing() {
         let turn = Rigid::new(DQuat::from_rotation_y(0.08), DVec3::ZERO);
         for truth in [turn, Rigid::IDENTITY] {
             let found = start(&seen(&truth, 150), &CAMERA, 7);
             assert_eq!(found.unwrap_err(), NoStart::NoParallax);
         }
+        let aside = Rigid::new(DQuat::from_rotation_y(0.05), DVec3::new(-0.4, 0.05, 0.1));
+        let wall = seen_between(&aside, 150, 4.0..4.001);
+        let found = start(&wall, &CAMERA, 7);
+        assert_eq!(
+            found.unwrap_err(),
+            NoStart::NoParallax,
+            "a plane has two motions"
+        );
         let few = seen(&turn, 20);
         assert_eq!(start(&few, &CAMERA, 7).unwrap_err(), NoStart::Lost);
     }
