@@ -58,21 +58,50 @@ fn errors(frames: &[Frame], found: &[OdometryFrame]) -> BTreeMap<u32, (usize, f6
     errors.collect()
 }
 
+/// What is asked of a run that is followed from its beginning.
+#[derive(Clone, Copy)]
+struct Bounds {
+    /// The first frame with a pose, at the latest.
+    first: usize,
+    /// Of the frames from there on, so many have a pose.
+    percent: usize,
+    /// Less than this share of the path's extent.
+    error: f64,
+}
+
+const BOUNDS: Bounds = Bounds {
+    first: 15,
+    percent: 95,
+    error: 0.03,
+};
+
+/// One segment, within the bounds.
+fn assert_followed(what: &str, frames: &[Frame], bounds: Bounds) -> Vec<OdometryFrame> {
+    let found = odometry_of(frames);
+    let first = found.iter().position(|f| f.pose.is_some());
+    let first = first.unwrap_or_else(|| panic!("{what}: no frame has a pose"));
+    assert!(first <= bounds.first, "{what}: begins with frame {first}");
+    let errors = errors(frames, &found);
+    assert_eq!(errors.len(), 1, "{what}: one segment: {errors:?}");
+    let (n, error) = errors[&1];
+    let n_asked = bounds.percent * (frames.len() - first);
+    assert!(100 * n >= n_asked, "{what}: {n} poses");
+    assert!(
+        error < bounds.error,
+        "{what}: {:.2} % of the path",
+        100.0 * error
+    );
+    found
+}
+
 #[test]
 fn a_walk_through_a_room_is_followed_from_the_first_parallax_on() {
     let frames = frames("synthetic:room?frames=90&width=320&height=240");
-    let found = odometry_of(&frames);
-    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
-    assert!(first <= 15, "begins with frame {first}");
-    let n_posed = found.iter().filter(|f| f.pose.is_some()).count();
-    assert!(
-        100 * n_posed >= 95 * (frames.len() - first),
-        "{n_posed} poses"
-    );
-    let errors = errors(&frames, &found);
-    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
-    let (_, error) = errors.values().next().unwrap();
-    assert!(*error < 0.02, "{:.2} % of the path's extent", 100.0 * error);
+    let bounds = Bounds {
+        error: 0.02,
+        ..BOUNDS
+    };
+    let found = assert_followed("a walk", &frames, bounds);
     for found in found.iter().filter_map(|f| f.pose) {
         assert!((0..6).all(|i| found.covariance[i][i] > 0.0));
     }
@@ -152,14 +181,11 @@ fn a_standing_camera_and_a_blank_wall_have_no_pose_and_the_reason() {
 fn dim_stripes_that_pass_quickly_are_followed() {
     // Windows on stripes are nearly flat, and repeat; many are dark.
     let frames = frames("synthetic:endless?frames=90&width=640&height=480&step=0.033");
-    let found = odometry_of(&frames);
-    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
-    assert!(first <= 15, "begins with frame {first}");
-    let errors = errors(&frames, &found);
-    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
-    let (n, error) = errors[&1];
-    assert!(100 * n >= 95 * (frames.len() - first), "{n} poses");
-    assert!(error < 0.05, "{:.2} % of the path's extent", 100.0 * error);
+    let bounds = Bounds {
+        error: 0.05,
+        ..BOUNDS
+    };
+    assert_followed("stripes", &frames, bounds);
 }
 
 #[test]
@@ -168,27 +194,12 @@ fn a_drive_of_a_car_is_followed_in_wide_images() {
         return;
     };
     let frames = frames(&format!("images:{}", folder.display()));
-    let found = odometry_of(&frames);
-    let first = found.iter().position(|f| f.pose.is_some()).unwrap();
-    assert!(first <= 6, "begins with frame {first}");
-    let errors = errors(&frames, &found);
-    assert_eq!(errors.len(), 1, "one segment: {errors:?}");
-    let (n, error) = errors[&1];
-    assert_eq!(n, frames.len() - first, "each frame has a pose");
-    assert!(error < 0.05, "{:.2} % of the path's extent", 100.0 * error);
-}
-
-/// Poses of at least 95 % of the frames from the first one on, in one segment, off by less than 3 % of the path.
-fn assert_followed(what: &str, frames: &[Frame]) {
-    let found = odometry_of(frames);
-    let first = found.iter().position(|f| f.pose.is_some());
-    let first = first.unwrap_or_else(|| panic!("{what}: no frame has a pose"));
-    assert!(first <= 15, "{what}: begins with frame {first}");
-    let errors = errors(frames, &found);
-    assert_eq!(errors.len(), 1, "{what}: one segment: {errors:?}");
-    let (n, error) = errors[&1];
-    assert!(100 * n >= 95 * (frames.len() - first), "{what}: {n} poses");
-    assert!(error < 0.03, "{what}: {:.2} % of the path", 100.0 * error);
+    let bounds = Bounds {
+        first: 6,
+        percent: 100,
+        error: 0.05,
+    };
+    assert_followed("a drive", &frames, bounds);
 }
 
 #[test]
@@ -197,9 +208,9 @@ fn lost_frames_other_rates_and_a_frozen_image_do_not_end_a_segment() {
     let dropped = all.iter().filter(|f| f.seq * 7 % 10 >= 3);
     let dropped: Vec<Frame> = dropped.cloned().collect();
     assert_eq!(dropped.len(), 63);
-    assert_followed("30 % of the frames dropped", &dropped);
+    assert_followed("30 % of the frames dropped", &dropped, BOUNDS);
     let half: Vec<Frame> = all.iter().step_by(2).cloned().collect();
-    assert_followed("half the rate", &half);
+    assert_followed("half the rate", &half, BOUNDS);
 
     // The camera goes on sending its image of frame 40 for a second and a half, then what it sees from there.
     let period = all[1].stamp.secs_since(all[0].stamp);
@@ -212,7 +223,7 @@ fn lost_frames_other_rates_and_a_frozen_image_do_not_end_a_segment() {
     let frozen: Vec<Frame> = frozen
         .chain(all[41..].iter().map(|frame| later(frame, 14)))
         .collect();
-    assert_followed("a frozen image", &frozen);
+    assert_followed("a frozen image", &frozen, BOUNDS);
 }
 
 #[test]

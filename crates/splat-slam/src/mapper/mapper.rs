@@ -406,9 +406,7 @@ impl Mapper {
         let ids: Vec<u32> = fresh.chain(deepened).copied().collect();
         self.balance(ids.len() * self.params.train.seeds_per_keyframe)?;
         let (mut parts, trainer) = self.split();
-        for id in deepened {
-            parts.splats.take_provisional(*id, parts.engine)?;
-        }
+        parts.splats.take_provisional(deepened, parts.engine)?;
         trainer.seed_each(&mut parts, &ids)?;
         self.report_renumbered();
         Ok(())

@@ -74,11 +74,8 @@ pub(crate) fn optical_flow(
     to: &Pyramid,
     points: &[[f32; 2]],
 ) -> Vec<Option<Found>> {
-    assert_eq!(from.image().size(), to.image().size(), "images of one size");
-    points
-        .par_iter()
-        .map(|point| follow(from, to, *point, [0.0; 2], usize::MAX, MIN_EIGENVALUE))
-        .collect()
+    let begin = |point: &[f32; 2]| Some((*point, Begin::anywhere(MIN_EIGENVALUE)));
+    follow_each(from, to, points, begin)
 }
 
 /// The same for corners, begun where one is expected: (point, where it may be now). Who is expected near is looked for on the finest
@@ -88,22 +85,16 @@ pub(crate) fn optical_flow_near(
     to: &Pyramid,
     points: &[([f32; 2], Option<[f32; 2]>)],
 ) -> Vec<Option<Found>> {
-    assert_eq!(from.image().size(), to.image().size(), "images of one size");
-    let follow = |(point, near): &([f32; 2], Option<[f32; 2]>)| match near {
-        Some(near) => {
-            let shift = [near[0] - point[0], near[1] - point[1]];
-            follow(from, to, *point, shift, LEVELS_NEAR, MIN_CORNER_EIGENVALUE)
-        }
-        None => follow(
-            from,
-            to,
-            *point,
-            [0.0; 2],
-            usize::MAX,
-            MIN_CORNER_EIGENVALUE,
-        ),
+    let anywhere = Begin::anywhere(MIN_CORNER_EIGENVALUE);
+    let begin = |(point, near): &([f32; 2], Option<[f32; 2]>)| {
+        let expected = near.map(|near| Begin {
+            shift: [near[0] - point[0], near[1] - point[1]],
+            n_levels: LEVELS_NEAR,
+            ..anywhere
+        });
+        Some((*point, expected.unwrap_or(anywhere)))
     };
-    points.par_iter().map(follow).collect()
+    follow_each(from, to, points, begin)
 }
 
 /// The same for points that may be anywhere within a seventh of the longer side: each begins where its
@@ -113,12 +104,46 @@ pub(crate) fn optical_flow_far(
     to: &Pyramid,
     points: &[[f32; 2]],
 ) -> Vec<Option<Found>> {
-    assert_eq!(from.image().size(), to.image().size(), "images of one size");
-    let search = |point: &[f32; 2]| {
-        let shift = most_alike(from, to, *point)?;
-        follow(from, to, *point, shift, usize::MAX, MIN_CORNER_EIGENVALUE)
+    let begin = |point: &[f32; 2]| {
+        let begin = Begin {
+            shift: most_alike(from, to, *point)?,
+            ..Begin::anywhere(MIN_CORNER_EIGENVALUE)
+        };
+        Some((*point, begin))
     };
-    points.par_iter().map(search).collect()
+    follow_each(from, to, points, begin)
+}
+
+/// How a point is looked for.
+#[derive(Debug, Clone, Copy)]
+struct Begin {
+    /// From where it was, at full size.
+    shift: [f32; 2],
+    /// On so many of the finest levels.
+    n_levels: usize,
+    /// Of its window, per pixel, at least.
+    min_eigenvalue: f32,
+}
+
+impl Begin {
+    fn anywhere(min_eigenvalue: f32) -> Self {
+        Self {
+            shift: [0.0; 2],
+            n_levels: usize::MAX,
+            min_eigenvalue,
+        }
+    }
+}
+
+fn follow_each<T: Sync>(
+    from: &Pyramid,
+    to: &Pyramid,
+    points: &[T],
+    begin: impl Fn(&T) -> Option<([f32; 2], Begin)> + Sync,
+) -> Vec<Option<Found>> {
+    assert_eq!(from.image().size(), to.image().size(), "images of one size");
+    let follow = |point: &T| begin(point).and_then(|(at, begin)| follow(from, to, at, begin));
+    points.par_iter().map(follow).collect()
 }
 
 /// The shift, at full size, after which the patch about a point on the coarsest level differs least; `None` where the patch
@@ -158,24 +183,16 @@ fn most_alike(from: &Pyramid, to: &Pyramid, point: [f32; 2]) -> Option<[f32; 2]>
     Some(found.0.map(|v| v as f32 / scale))
 }
 
-/// `expected`: the shift to begin with, at full size. Of the levels, the `n_levels` finest.
-fn follow(
-    from: &Pyramid,
-    to: &Pyramid,
-    point: [f32; 2],
-    expected: [f32; 2],
-    n_levels: usize,
-    min_eigenvalue: f32,
-) -> Option<Found> {
-    let n_levels = n_levels.min(from.levels.len());
+fn follow(from: &Pyramid, to: &Pyramid, point: [f32; 2], begin: Begin) -> Option<Found> {
+    let n_levels = begin.n_levels.min(from.levels.len());
     let coarsest = 0.5_f32.powi(n_levels.saturating_sub(1) as i32);
-    let mut shift = expected.map(|v| v * coarsest);
+    let mut shift = begin.shift.map(|v| v * coarsest);
     let levels = from.levels.iter().zip(&to.levels).take(n_levels);
     for (level_ix, (from, to)) in levels.enumerate().rev() {
         let scale = 0.5_f32.powi(level_ix as i32);
         let centre = point.map(|v| v * scale);
         let window = Window::cut(&from.image, &from.gradients, centre);
-        let inverse = window.inverse_tensor(min_eigenvalue)?;
+        let inverse = window.inverse_tensor(begin.min_eigenvalue)?;
         for _ in 0..MAX_ITERATIONS {
             let at = [centre[0] + shift[0], centre[1] + shift[1]];
             let [d, e] = window.descent(&to.image, at);

@@ -74,7 +74,9 @@ impl FeatureTracks {
             let places: Vec<[f32; 2]> = points.iter().map(|(at, _)| *at).collect();
             let anywhere: Vec<_> = places.iter().map(|at| (*at, None)).collect();
             let at_rest: Vec<_> = places.iter().map(|at| (*at, Some(*at))).collect();
-            keep_better(&mut found, optical_flow_near(&last, &next, &anywhere));
+            if points.iter().any(|(_, expected)| expected.is_some()) {
+                keep_better(&mut found, optical_flow_near(&last, &next, &anywhere));
+            }
             keep_better(&mut found, optical_flow_near(&last, &next, &at_rest));
             if !is_enough(&found) {
                 keep_better(&mut found, optical_flow_far(&last, &next, &places));

@@ -150,17 +150,19 @@ impl SplatSet {
         Ok(())
     }
 
-    /// Takes away what stood in for the depth of a keyframe.
+    /// Takes away what stood in for the depth of keyframes.
     pub(crate) fn take_provisional(
         &mut self,
-        keyframe_id: u32,
+        keyframe_ids: &[u32],
         engine: &mut dyn Engine,
     ) -> Result<(), EngineError> {
-        let Some(provisional) = self.provisional.remove(&keyframe_id) else {
+        let ids = keyframe_ids.iter();
+        let gone: Vec<Range<u32>> = ids.filter_map(|id| self.provisional.remove(id)).collect();
+        if gone.is_empty() {
             return Ok(());
-        };
-        let ids = self.ids.all().iter();
-        let keep: Vec<bool> = ids.map(|id| !provisional.contains(id)).collect();
+        }
+        let stays = |id: &u32| !gone.iter().any(|range| range.contains(id));
+        let keep: Vec<bool> = self.ids.all().iter().map(stays).collect();
         if keep.iter().any(|k| !k) {
             self.retain(&keep, engine)?;
         }
