@@ -5,14 +5,14 @@ use std::path::Path;
 use crate::error::FeaturesError;
 use crate::features::descriptor::Features;
 use crate::features::params::{FeatureKind, FeatureParams};
-use crate::features::scale_space::Grey;
+use crate::features::scale_space::{Grey, SpareMemory};
 use crate::features::xfeat::Xfeat;
 use crate::features::{orb, sift};
 
 /// Finds features of one kind.
 #[derive(Debug)]
 pub enum FeatureExtractor {
-    Sift,
+    Sift(SpareMemory),
     Orb,
     Xfeat(Box<Xfeat>),
 }
@@ -20,7 +20,7 @@ pub enum FeatureExtractor {
 impl FeatureExtractor {
     pub fn new(params: &FeatureParams) -> Result<Self, FeaturesError> {
         match params.kind {
-            FeatureKind::Auto | FeatureKind::Sift => Ok(Self::Sift),
+            FeatureKind::Auto | FeatureKind::Sift => Ok(Self::Sift(SpareMemory::default())),
             FeatureKind::Orb => Ok(Self::Orb),
             FeatureKind::Xfeat if params.xfeat_model.is_empty() => Err(FeaturesError::NoModel),
             FeatureKind::Xfeat => {
@@ -33,7 +33,7 @@ impl FeatureExtractor {
     /// At most `max_features` points of an image. Images too small for the kind, and broken ones, have none.
     pub fn features(&self, image: &Grey, max_features: usize) -> Features {
         match self {
-            Self::Sift => sift::features(image, max_features),
+            Self::Sift(spare) => sift::features_within(spare, image, max_features),
             Self::Orb => orb::features(image, max_features),
             Self::Xfeat(network) => network.features(image, max_features),
         }

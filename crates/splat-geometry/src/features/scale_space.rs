@@ -2,8 +2,12 @@
 //!
 //! Knows nothing of descriptors or cameras. Positions are in pixels of the input image, centres at +0.5.
 
+use std::sync::{Mutex, PoisonError};
+
 use rayon::prelude::*;
 
+/// Numbers of spare memory at most: 128 MB, what pyramids of two images of 640x480 take.
+const MAX_SPARE: usize = 1 << 25;
 /// Layers per octave in which extrema are looked for (Lowe 2004, section 3.3).
 const LAYERS: usize = 3;
 /// Blur of the first layer of every octave, in pixels of that octave.
@@ -31,8 +35,36 @@ pub struct Octave {
     /// Input pixels per pixel of this octave.
     pub step: f32,
     pub layers: Vec<Grey>,
-    /// `differences[i]` is layer i + 1 less layer i.
-    pub differences: Vec<Grey>,
+}
+
+/// Memory of earlier pyramids. The system clears what it hands out, and takes longer for that than blurring takes.
+#[derive(Debug, Default)]
+pub struct SpareMemory(Mutex<Vec<Vec<f32>>>);
+
+impl SpareMemory {
+    /// `n` numbers that mean nothing.
+    fn take(&self, n: usize) -> Vec<f32> {
+        let mut spare = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let fitting = spare.iter().position(|numbers| numbers.len() == n);
+        let found = fitting.map(|ix| spare.swap_remove(ix));
+        drop(spare);
+        found.unwrap_or_else(|| vec![0.0; n])
+    }
+
+    fn keep(&self, done: impl IntoIterator<Item = Grey>) {
+        let mut spare = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        spare.extend(done.into_iter().map(|grey| grey.pixels));
+        // Of images of another size, perhaps.
+        let mut n_spare: usize = spare.iter().map(Vec::len).sum();
+        while n_spare > MAX_SPARE {
+            n_spare -= spare.remove(0).len();
+        }
+    }
+
+    /// Of a pyramid that is no longer needed.
+    pub fn keep_all(&self, octaves: Vec<Octave>) {
+        self.keep(octaves.into_iter().flat_map(|octave| octave.layers));
+    }
 }
 
 /// A blob: place in its octave's pixels (centres at integers), layer and blur.
@@ -58,10 +90,10 @@ impl Grey {
     }
 
     /// Linear between the centres of the pixels.
-    fn doubled(&self) -> Self {
+    fn doubled(&self, spare: &SpareMemory) -> Self {
         let (w, h) = (self.width, self.height);
         let row_of = |y: usize| &self.pixels[y.min(h - 1) * w..][..w];
-        let mut pixels = vec![0.0; 4 * w * h];
+        let mut pixels = spare.take(4 * w * h);
         pixels
             .par_chunks_mut(2 * w)
             .enumerate()
@@ -97,93 +129,91 @@ impl Grey {
         }
     }
 
-    /// A Gaussian down and then along each row, while the row is in the first cache.
+    /// Blurred by a Gaussian.
     pub fn blurred(&self, sigma: f32) -> Self {
         let kernel = half_gaussian(sigma);
-        let radius = kernel.len() - 1;
-        let (w, h) = (self.width, self.height);
-        let mut pixels = vec![0.0_f32; w * h];
-        let padded = || vec![0.0_f32; w + 2 * radius];
-        pixels
-            .par_chunks_mut(w)
-            .enumerate()
-            .for_each_init(padded, |padded, (y, out)| {
-                let row_of = |by: isize| &self.pixels[mirrored(y as isize + by, h) * w..][..w];
-                let pairs: Vec<[&[f32]; 2]> = (0..=radius as isize)
-                    .map(|k| [row_of(-k), row_of(k)])
-                    .collect();
-                weighted_sum(&pairs, &kernel, &mut padded[radius..radius + w]);
-                for i in 1..=radius {
-                    padded[radius - i] = padded[radius + mirrored(-(i as isize), w)];
-                    padded[radius + w - 1 + i] = padded[radius + mirrored((w - 1 + i) as isize, w)];
-                }
-                let shifted: Vec<[&[f32]; 2]> = (0..=radius)
-                    .map(|k| [&padded[radius - k..][..w], &padded[radius + k..][..w]])
-                    .collect();
-                weighted_sum(&shifted, &kernel, out);
-            });
-        Self {
-            width: w,
-            height: h,
-            pixels,
-        }
+        let mut pixels = vec![0.0_f32; self.pixels.len()];
+        let rows = pixels.par_chunks_mut(self.width).enumerate();
+        rows.for_each_init(Vec::new, |padded, (y, out)| {
+            self.blur_row(y, &kernel, padded, out);
+        });
+        self.of_same_size(pixels)
     }
 
-    fn minus(&self, other: &Self) -> Self {
-        let mut pixels = vec![0.0; self.pixels.len()];
-        pixels
-            .par_chunks_mut(self.width)
-            .zip(self.pixels.par_chunks(self.width))
-            .zip(other.pixels.par_chunks(self.width))
-            .for_each(|((out, a), b)| {
-                for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
-                    *out = a - b;
-                }
-            });
+    /// Blurred, and what that has added to each pixel.
+    fn blurred_with_difference(&self, sigma: f32, spare: &SpareMemory) -> (Self, Self) {
+        let kernel = half_gaussian(sigma);
+        let n = self.pixels.len();
+        let (mut pixels, mut difference) = (spare.take(n), spare.take(n));
+        let rows = pixels.par_chunks_mut(self.width);
+        let rows = rows.zip(difference.par_chunks_mut(self.width)).enumerate();
+        rows.for_each_init(Vec::new, |padded, (y, (out, difference))| {
+            self.blur_row(y, &kernel, padded, out);
+            let before = &self.pixels[y * self.width..][..self.width];
+            for ((difference, after), before) in difference.iter_mut().zip(out).zip(before) {
+                *difference = *after - before;
+            }
+        });
+        (self.of_same_size(pixels), self.of_same_size(difference))
+    }
+
+    fn of_same_size(&self, pixels: Vec<f32>) -> Self {
         Self {
             width: self.width,
             height: self.height,
             pixels,
         }
     }
+
+    /// A Gaussian down and then along a row, while the row is in the first cache. `padded` is memory for the row with its margins.
+    fn blur_row(&self, y: usize, kernel: &[f32], padded: &mut Vec<f32>, out: &mut [f32]) {
+        let radius = kernel.len() - 1;
+        let (w, h) = (self.width, self.height);
+        padded.resize(w + 2 * radius, 0.0);
+        let row_of = |by: isize| &self.pixels[mirrored(y as isize + by, h) * w..][..w];
+        let pairs: Vec<[&[f32]; 2]> = (0..=radius as isize)
+            .map(|k| [row_of(-k), row_of(k)])
+            .collect();
+        weighted_sum(&pairs, kernel, &mut padded[radius..radius + w]);
+        for i in 1..=radius {
+            padded[radius - i] = padded[radius + mirrored(-(i as isize), w)];
+            padded[radius + w - 1 + i] = padded[radius + mirrored((w - 1 + i) as isize, w)];
+        }
+        let shifted: Vec<[&[f32]; 2]> = (0..=radius)
+            .map(|k| [&padded[radius - k..][..w], &padded[radius + k..][..w]])
+            .collect();
+        weighted_sum(&shifted, kernel, out);
+    }
 }
 
-/// The pyramid. Octave 0 has twice the input's resolution: small images hold most of their blobs there.
-pub fn pyramid(image: &Grey) -> Vec<Octave> {
-    let first = image.doubled();
-    let mut base = first.blurred((BASE_SIGMA.powi(2) - (2.0 * CAMERA_SIGMA).powi(2)).sqrt());
-    let mut octaves = Vec::new();
+/// The pyramid and its blobs: extrema of the differences of neighbouring layers, refined to parts of a pixel, in a fixed
+/// order. Octave 0 has twice the input's resolution: small images hold most of their blobs there.
+pub fn pyramid(image: &Grey, spare: &SpareMemory) -> (Vec<Octave>, Vec<Blob>) {
+    let first = image.doubled(spare);
+    let sigma = (BASE_SIGMA.powi(2) - (2.0 * CAMERA_SIGMA).powi(2)).sqrt();
+    let mut base = first.blurred(sigma);
+    spare.keep([first]);
+    let (mut octaves, mut found) = (Vec::new(), Vec::new());
     let mut step = 0.5;
     while base.width.min(base.height) >= 24 && octaves.len() < 8 {
         let (mut layers, mut differences) = (vec![base], Vec::new());
         for i in 1..LAYERS + 3 {
             let grown = layer_sigma(i).powi(2) - layer_sigma(i - 1).powi(2);
-            let next = layers[i - 1].blurred(grown.sqrt());
-            differences.push(next.minus(&layers[i - 1]));
+            let (next, difference) = layers[i - 1].blurred_with_difference(grown.sqrt(), spare);
+            differences.push(difference);
             layers.push(next);
         }
         base = layers[LAYERS].halved();
-        octaves.push(Octave {
-            step,
-            layers,
-            differences,
-        });
+        found.extend(blobs(octaves.len(), &differences));
+        spare.keep(differences);
+        octaves.push(Octave { step, layers });
         step *= 2.0;
     }
-    octaves
+    (octaves, found)
 }
 
-/// Extrema of the differences of neighbouring layers, refined to parts of a pixel, in a fixed order.
-pub fn blobs(octaves: &[Octave]) -> Vec<Blob> {
-    octaves
-        .iter()
-        .enumerate()
-        .flat_map(|(ix, octave)| blobs_of_octave(ix, octave))
-        .collect()
-}
-
-fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
-    let differences = &octave.differences;
+/// Of one octave; `differences[i]` is layer i + 1 less layer i.
+fn blobs(octave_ix: usize, differences: &[Grey]) -> Vec<Blob> {
     let (w, h) = (differences[0].width, differences[0].height);
     let rows =
         (1..=LAYERS).flat_map(|layer| (BORDER..h.saturating_sub(BORDER)).map(move |y| (layer, y)));
@@ -192,9 +222,19 @@ fn blobs_of_octave(octave_ix: usize, octave: &Octave) -> Vec<Blob> {
         .par_iter()
         .map_init(Vec::new, |is_peak, &(layer, y)| {
             peaks_of_row(&differences[layer], y, is_peak);
-            let candidates = (BORDER..w - BORDER)
-                .filter(|&x| is_peak[x] != 0 && is_extremum(differences, layer, x, y));
-            candidates
+            // Nearly all are none.
+            let stretches = is_peak.chunks(16).enumerate();
+            let some = stretches.filter(|(_, peaks)| peaks.iter().fold(0, |a, b| a | b) != 0);
+            let peaks = some.flat_map(|(ix, peaks)| {
+                let here = peaks
+                    .iter()
+                    .enumerate()
+                    .filter(|(_, is_peak)| **is_peak != 0);
+                here.map(move |(at, _)| 16 * ix + at)
+            });
+            peaks
+                .filter(|x| (BORDER..w - BORDER).contains(x))
+                .filter(|&x| beats_neighbour_layers(differences, layer, x, y))
                 .filter_map(|x| refined(differences, layer, x, y))
                 .map(|b| Blob {
                     octave: octave_ix,
@@ -297,7 +337,8 @@ fn weighted_sum(pairs: &[[&[f32]; 2]], weights: &[f32], out: &mut [f32]) {
     }
 }
 
-fn is_extremum(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
+/// Whether a peak of its own layer is one among the layers above and below, too.
+fn beats_neighbour_layers(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
     let w = differences[layer].width;
     let centre = differences[layer].pixels[y * w + x];
     let beats = |other: f32| {
@@ -307,7 +348,7 @@ fn is_extremum(differences: &[Grey], layer: usize, x: usize, y: usize) -> bool {
             centre <= other
         }
     };
-    [layer, layer - 1, layer + 1].into_iter().all(|l| {
+    [layer - 1, layer + 1].into_iter().all(|l| {
         (y - 1..=y + 1).all(|row| {
             differences[l].pixels[row * w + x - 1..row * w + x + 2]
                 .iter()

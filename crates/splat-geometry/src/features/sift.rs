@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use crate::features::descriptor::{Descriptors, Features, MAX_SUBMAP, SIFT_LENGTH};
-use crate::features::scale_space::{Blob, Grey, Octave, blobs, pyramid};
+use crate::features::scale_space::{Blob, Grey, Octave, SpareMemory, pyramid};
 
 /// Cells along one side of the descriptor, and directions in each.
 const CELLS: usize = 4;
@@ -28,10 +28,15 @@ const MIN_SIDE_PX: usize = 24;
 
 /// At most `max_features` points, the strongest first.
 pub fn features(image: &Grey, max_features: usize) -> Features {
+    features_within(&SpareMemory::default(), image, max_features)
+}
+
+/// The same in memory of earlier images.
+pub fn features_within(spare: &SpareMemory, image: &Grey, max_features: usize) -> Features {
     if image.width.min(image.height) < MIN_SIDE_PX || !image.is_whole() {
         return Features::default();
     }
-    let (octaves, mut found) = detected(image);
+    let (octaves, mut found) = pyramid(image, spare);
     found.sort_by(|a, b| b.contrast.total_cmp(&a.contrast));
     found.truncate(max_features);
     let layer_of = |blob: &Blob| &octaves[blob.octave].layers[blob.layer];
@@ -45,7 +50,7 @@ pub fn features(image: &Grey, max_features: usize) -> Features {
     let turned: Vec<(Blob, f32)> = turned.into_iter().flatten().take(max_features).collect();
     let shares = Shares::new();
     let described = |(blob, angle): &(Blob, f32)| descriptor(layer_of(blob), blob, *angle, &shares);
-    Features {
+    let features = Features {
         pixels: turned
             .iter()
             .map(|(b, _)| pixel(&octaves[b.octave], b))
@@ -55,16 +60,9 @@ pub fn features(image: &Grey, max_features: usize) -> Features {
             .map(|(b, _)| b.sigma * octaves[b.octave].step)
             .collect(),
         descriptors: Descriptors::Sift(turned.par_iter().map(described).collect()),
-    }
-}
-
-fn detected(image: &Grey) -> (Vec<Octave>, Vec<Blob>) {
-    let mut octaves = pyramid(image);
-    let found = blobs(&octaves);
-    octaves
-        .iter_mut()
-        .for_each(|octave| octave.differences.clear());
-    (octaves, found)
+    };
+    spare.keep_all(octaves);
+    features
 }
 
 /// Octave 0 is the input doubled about pixel centres at +0.5; halving keeps every second centre, which shifts nothing in

@@ -22,16 +22,20 @@ impl Grey {
     /// At the size of the depth map.
     pub(crate) fn of_image(image: &RgbImage, params: &MvsParams) -> Self {
         let (width, height) = (image.width_px as usize, image.height_px as usize);
-        Self::resized(image, working_size(width, height, params))
+        let mut colours = Vec::new();
+        let grey = Self::resized(
+            image,
+            working_size(width, height, params),
+            Some(&mut colours),
+        );
+        Self { colours, ..grey }
     }
 
     /// Of the same image twice the size of this, as far as the image has it; without colours.
     pub(crate) fn finer(&self, image: &RgbImage) -> Self {
         let width = (2 * self.width).min(image.width_px as usize);
         let height = (2 * self.height).min(image.height_px as usize);
-        let mut finer = Self::resized(image, (width, height));
-        finer.colours = Vec::new();
-        finer
+        Self::resized(image, (width, height), None)
     }
 
     pub(crate) fn empty() -> Self {
@@ -43,8 +47,12 @@ impl Grey {
         }
     }
 
-    /// An image whose pixels do not fit its size counts as empty.
-    fn resized(image: &RgbImage, (width, height): (usize, usize)) -> Self {
+    /// An image whose pixels do not fit its size counts as empty. The colours go where they are asked for.
+    fn resized(
+        image: &RgbImage,
+        (width, height): (usize, usize),
+        mut colours: Option<&mut Vec<[u8; 3]>>,
+    ) -> Self {
         let (from_width, from_height) = (image.width_px as usize, image.height_px as usize);
         let fits = from_width
             .checked_mul(from_height)
@@ -53,36 +61,33 @@ impl Grey {
         if !fits || image.pixels.is_empty() {
             return Self::empty();
         }
-        let columns = shares(from_width, width);
-        let rows = shares(from_height, height);
+        let pixels = image.pixels.as_chunks::<3>().0;
+        let is_whole = |factor| (from_width, from_height) == (factor * width, factor * height);
+        let shares = [from_width, from_height].into_iter().zip([width, height]);
+        let shares: Vec<Vec<Share>> = shares.map(|(from, into)| shares_of(from, into)).collect();
         let mut sums = vec![[0.0_f32; 3]; width];
-        let (mut values, mut colours) = (Vec::new(), Vec::new());
-        values.reserve_exact(width * height);
-        colours.reserve_exact(width * height);
-        for row in &rows {
-            sums.fill([0.0; 3]);
-            for (from_y, share_y) in row.cells() {
-                let pixels = &image.pixels[3 * from_y * from_width..3 * (from_y + 1) * from_width];
-                let (pixels, _) = pixels.as_chunks::<3>();
-                for (sum, column) in sums.iter_mut().zip(&columns) {
-                    for (from_x, share_x) in column.cells() {
-                        for (sum, value) in sum.iter_mut().zip(pixels[from_x]) {
-                            *sum += share_y * share_x * f32::from(value);
-                        }
-                    }
-                }
+        let mut values = Vec::with_capacity(width * height);
+        for y in 0..height {
+            if is_whole(1) {
+                means_of_squares::<1>(pixels, from_width, y, &mut sums);
+            } else if is_whole(2) {
+                means_of_squares::<2>(pixels, from_width, y, &mut sums);
+            } else {
+                means_of_shares(pixels, from_width, (&shares[0], &shares[1][y]), &mut sums);
             }
             for sum in &sums {
                 let luma: f32 = sum.iter().zip(LUMA).map(|(c, weight)| c * weight).sum();
                 values.push(luma / 255.0 - 0.5);
-                colours.push(sum.map(|c| c.round() as u8));
+            }
+            if let Some(colours) = &mut colours {
+                colours.extend(sums.iter().map(|sum| sum.map(|c| c.round() as u8)));
             }
         }
         Self {
             width,
             height,
             values,
-            colours,
+            colours: Vec::new(),
         }
     }
 
@@ -120,7 +125,50 @@ impl Share {
     }
 }
 
-fn shares(from: usize, into: usize) -> Vec<Share> {
+/// A row of means of `SIDE` by `SIDE` pixels, 1 or 2, which are the shares that any size has, without their cost: sums of so few
+/// bytes, and their quarters, are exact.
+fn means_of_squares<const SIDE: usize>(
+    pixels: &[[u8; 3]],
+    from_width: usize,
+    y: usize,
+    means: &mut [[f32; 3]],
+) {
+    let rows: [&[[u8; 3]]; SIDE] =
+        std::array::from_fn(|dy| &pixels[(SIDE * y + dy) * from_width..][..from_width]);
+    for (x, mean) in means.iter_mut().enumerate() {
+        let mut sum = [0_u16; 3];
+        for row in rows {
+            for pixel in &row[SIDE * x..SIDE * (x + 1)] {
+                for (sum, value) in sum.iter_mut().zip(pixel) {
+                    *sum += u16::from(*value);
+                }
+            }
+        }
+        *mean = sum.map(|sum| f32::from(sum) / (SIDE * SIDE) as f32);
+    }
+}
+
+/// A row of means over parts of pixels.
+fn means_of_shares(
+    pixels: &[[u8; 3]],
+    from_width: usize,
+    (columns, row): (&[Share], &Share),
+    means: &mut [[f32; 3]],
+) {
+    means.fill([0.0; 3]);
+    for (from_y, share_y) in row.cells() {
+        let pixels = &pixels[from_y * from_width..(from_y + 1) * from_width];
+        for (mean, column) in means.iter_mut().zip(columns) {
+            for (from_x, share_x) in column.cells() {
+                for (mean, value) in mean.iter_mut().zip(pixels[from_x]) {
+                    *mean += share_y * share_x * f32::from(value);
+                }
+            }
+        }
+    }
+}
+
+fn shares_of(from: usize, into: usize) -> Vec<Share> {
     let edge = |ix: usize| ix as f64 * from as f64 / into as f64;
     (0..into)
         .map(|ix| Share {
@@ -143,7 +191,7 @@ mod tests {
             height_px,
             pixels: pixels.collect(),
         };
-        let grey = Grey::resized(&image, (8, 6));
+        let grey = Grey::resized(&image, (8, 6), None);
         let finer = grey.finer(&image);
         assert_eq!((finer.width, finer.height), (16, 12));
         for (ix, value) in grey.values.iter().enumerate() {
@@ -151,7 +199,27 @@ mod tests {
             let four = [finer.row(y), finer.row(y + 1)].map(|row| row[x] + row[x + 1]);
             assert!((value - (four[0] + four[1]) / 4.0).abs() < 1e-5, "{ix}");
         }
-        let full = Grey::resized(&image, (32, 24));
+        let full = Grey::resized(&image, (32, 24), None);
         assert_eq!(full.finer(&image).values, full.values);
+    }
+
+    #[test]
+    fn whole_pixels_are_averaged_as_parts_of_pixels_are() {
+        let pixels: Vec<[u8; 3]> = (0..32 * 24)
+            .map(|ix: usize| [ix * 37, ix * 91, ix * 53].map(|v| (v % 256) as u8))
+            .collect();
+        for side in [1, 2] {
+            let (width, height) = (32 / side, 24 / side);
+            let columns = shares_of(32, width);
+            for (y, row) in shares_of(24, height).iter().enumerate() {
+                let (mut whole, mut parts) = (vec![[0.0; 3]; width], vec![[0.0; 3]; width]);
+                match side {
+                    1 => means_of_squares::<1>(&pixels, 32, y, &mut whole),
+                    _ => means_of_squares::<2>(&pixels, 32, y, &mut whole),
+                }
+                means_of_shares(&pixels, 32, (&columns, row), &mut parts);
+                assert_eq!(whole, parts, "row {y} of squares of {side}");
+            }
+        }
     }
 }
