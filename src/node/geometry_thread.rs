@@ -247,7 +247,13 @@ fn next(stage: &mut GeometryStage, depth: &mut DepthWork, batches: &Receiver<Arc
         return Next::Batch(batch);
     }
     if let Some(refined) = stage.refine() {
-        return Next::Answer(refined);
+        let has_changed =
+            refined.is_loop || !(refined.views.is_empty() && refined.revised.is_empty());
+        return if has_changed {
+            Next::Answer(refined)
+        } else {
+            Next::Nothing
+        };
     }
     if depth.is_at_work {
         match depth.swept.recv_timeout(DEPTH_TICK) {

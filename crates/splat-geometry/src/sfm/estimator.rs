@@ -19,10 +19,10 @@ use crate::sfm::dense_depth::{Densifier, NextDepth};
 use crate::sfm::initialize::{Start, start};
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::merge;
-use crate::sfm::pairwise::{link_alike, link_anew, link_older, link_recent};
+use crate::sfm::pairwise::{link_alike, link_anew, link_last, link_older, link_recent};
 use crate::sfm::params::SfmParams;
-use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView};
-use crate::sfm::register::grow;
+use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView, Submap};
+use crate::sfm::register::{grow, grow_at_once};
 use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
 use crate::sfm::updates::{Reported, SparseBatch, note};
 use splat_types::camera::Intrinsics;
@@ -36,8 +36,13 @@ const MIN_NEW_SUBMAP: usize = 4;
 const MAX_WAITING: usize = 64;
 /// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
 const MAX_IMAGES: usize = 128;
-/// Live: views that may wait for their places of long ago to be looked for.
+/// Live: views that may wait for what they have seen long ago to be looked for. Of more, the oldest do without.
 const MAX_BEHIND: usize = 16;
+/// Live: when so many keyframes have gathered, each is matched with fewer of those before it, so that the next ones wait less.
+const MANY_NEW: usize = 3;
+const N_LAST_OF_MANY: usize = 4;
+/// Steps of the adjustment of a submap that has grown.
+const N_GROWN_STEPS: usize = 8;
 /// Focal length of an uncalibrated camera before it is known, as a share of the longer side.
 const FIRST_FOCAL: f64 = 0.9;
 
@@ -89,41 +94,64 @@ impl Sfm {
     fn sparse_soon(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
         let first_new = self.scene.views.len();
-        let limits = self.take_in_with(&batch.keyframes, link_recent);
+        let n_new = batch.keyframes.len().saturating_sub(batch.n_shared);
+        let n_last = if n_new >= MANY_NEW {
+            N_LAST_OF_MANY
+        } else {
+            usize::MAX
+        };
+        let limits = self.take_in_with(&batch.keyframes, |scene, newest, max_error_px, seed| {
+            link_last(scene, newest, n_last, max_error_px, seed);
+        });
         self.behind.extend(first_new..self.scene.views.len());
         let fresh = self.behind.clone();
-        grow(&mut self.scene, &fresh, &limits);
+        grow_at_once(&mut self.scene, &fresh, &limits);
         let is_missing = |ix: &usize| self.scene.views[*ix].registered.is_none();
-        if fresh.iter().any(is_missing) || fresh.len() > MAX_BEHIND {
-            self.link_behind(&limits);
+        let missing: Vec<usize> = fresh.into_iter().filter(is_missing).collect();
+        if !missing.is_empty() {
+            self.behind.retain(|ix| !missing.contains(ix));
+            self.link_older(&missing, &limits);
             self.catch_up(&limits);
         }
+        // Their neighbours stand for those that no time was left for.
+        let n_left_out = self.behind.len().saturating_sub(MAX_BEHIND);
+        self.behind.drain(..n_left_out);
         let shared = self.shared_views(batch);
         self.report(&shared)
     }
 
-    /// What `sparse_soon` has left. `None`: nothing.
+    /// Some of what `sparse_soon` has left, in slices, since new keyframes wait meanwhile: what one view has seen long ago,
+    /// or the adjustment of one submap. `None`: nothing is left.
     fn refined(&mut self) -> Option<SparseBatch> {
-        if self.behind.is_empty() {
-            return None;
-        }
         let newest = self.scene.views.last().map(|v| Arc::clone(&v.keyframe));
         let limits = self.limits(newest.as_slice());
-        self.link_behind(&limits);
-        self.catch_up(&limits);
+        if self.behind.is_empty() {
+            let grown = self.grown().next()?;
+            adjust_global(&mut self.scene, grown, limits.max_error_px, N_GROWN_STEPS);
+        } else {
+            let next = self.behind.remove(0);
+            self.link_older(&[next], &limits);
+            self.place_newest(&limits);
+        }
         Some(self.report(&[]))
     }
 
     /// Registers what waits by all links, closes loops, and adjusts what has grown.
     fn catch_up(&mut self, limits: &Limits) {
+        self.place_newest(limits);
+        for submap in self.grown().collect::<Vec<u32>>() {
+            adjust_global(&mut self.scene, submap, limits.max_error_px, N_GROWN_STEPS);
+        }
+    }
+
+    fn place_newest(&mut self, limits: &Limits) {
         let waiting = self.waiting();
         let newest = &waiting[waiting.len().saturating_sub(MAX_WAITING)..];
         self.place_waiting(newest, limits, MIN_NEW_SUBMAP);
-        self.adjust_grown(limits);
     }
 
-    fn link_behind(&mut self, limits: &Limits) {
-        for view_ix in std::mem::take(&mut self.behind) {
+    fn link_older(&mut self, views: &[usize], limits: &Limits) {
+        for &view_ix in views {
             link_older(&mut self.scene, view_ix, limits.max_error_px, self.seed);
         }
     }
@@ -137,6 +165,8 @@ impl Sfm {
             .map(|s| Arc::clone(&s.keyframe))
             .collect();
         let limits = self.limits(&keyframes);
+        let behind = std::mem::take(&mut self.behind);
+        self.link_older(&behind, &limits);
         let waiting = self.waiting();
         for &view in &waiting {
             self.scene.views[view].failed_with = 0;
@@ -353,14 +383,16 @@ impl Sfm {
         }
     }
 
-    /// All views of a submap together, when it grew enough to be worth it.
-    fn adjust_grown(&mut self, limits: &Limits) {
-        for submap in 0..self.scene.submaps.len() as u32 {
-            let size = &self.scene.submaps[submap as usize];
-            if size.views.len() as f64 >= 1.1 * size.n_adjusted as f64 {
-                adjust_global(&mut self.scene, submap, limits.max_error_px, 8);
-            }
-        }
+    /// Submaps whose views should be adjusted together, since there are so many more of them.
+    fn grown(&self) -> impl Iterator<Item = u32> {
+        let submaps = (0..).zip(&self.scene.submaps);
+        let is_grown = |size: &Submap| {
+            let n_views = size.views.len();
+            n_views > 0 && n_views as f64 >= 1.1 * size.n_adjusted as f64
+        };
+        submaps
+            .filter(move |(_, size)| is_grown(size))
+            .map(|(submap, _)| submap)
     }
 
     pub(crate) fn densify(&mut self, sparse: &SparseBatch) -> GeometryBatch {

@@ -28,7 +28,19 @@ pub(crate) fn link_recent(
     max_error_px: f64,
     seed: u64,
 ) {
-    let others: Vec<usize> = (view_ix.saturating_sub(N_RECENT)..view_ix).collect();
+    link_last(scene, view_ix, N_RECENT, max_error_px, seed);
+}
+
+/// Links a view to so many just before it, at most as many as `link_recent` takes.
+pub(crate) fn link_last(
+    scene: &mut Reconstruction,
+    view_ix: usize,
+    n_last: usize,
+    max_error_px: f64,
+    seed: u64,
+) {
+    let first = view_ix.saturating_sub(n_last.min(N_RECENT));
+    let others: Vec<usize> = (first..view_ix).collect();
     link(scene, view_ix, &others, max_error_px, seed);
 }
 

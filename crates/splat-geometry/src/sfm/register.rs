@@ -17,31 +17,68 @@ const GLOBAL_GROWTH: f64 = 1.3;
 /// side) could slide or turn freely.
 const MIN_SPREAD: f64 = 0.03;
 
-/// Places as many of the waiting views of `pool` as can be registered.
+/// Places as many of the waiting views of `pool` as can be registered, and adjusts about each.
 pub(crate) fn grow(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
+    while let Some(registered) = register_best(scene, pool, limits) {
+        adjust_about(scene, &[registered], limits);
+    }
+}
+
+/// The same sooner: the neighbourhood of the views is adjusted once, when all are registered.
+pub(crate) fn grow_at_once(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
+    let registered: Vec<Registered> =
+        std::iter::from_fn(|| register_best(scene, pool, limits)).collect();
+    adjust_about(scene, &registered, limits);
+}
+
+/// A view with its first pose, and the number of matches that spoke for it.
+struct Registered {
+    view: usize,
+    submap: u32,
+    n_pairs: usize,
+}
+
+/// Gives the best supported of the waiting views a pose, and new landmarks by it. `None`: there is none left.
+fn register_best(
+    scene: &mut Reconstruction,
+    pool: &[usize],
+    limits: &Limits,
+) -> Option<Registered> {
     while let Some((view, submap, pairs)) = best_waiting(scene, pool, limits) {
+        let n_pairs = pairs.len();
         let Some(cam_from_world) = pose(scene, view, &pairs, limits) else {
-            scene.views[view].failed_with = pairs.len();
+            scene.views[view].failed_with = n_pairs;
             continue;
         };
         scene.place(view, submap, cam_from_world);
         extend(scene, view, limits.max_error_px);
-        adjust_local(scene, view, limits);
+        return Some(Registered {
+            view,
+            submap,
+            n_pairs,
+        });
+    }
+    None
+}
+
+/// Adjusts about the last of the views that were registered; those whose landmarks are thrown out again wait on.
+fn adjust_about(scene: &mut Reconstruction, registered: &[Registered], limits: &Limits) {
+    let Some(last) = registered.last() else {
+        return;
+    };
+    adjust_local(scene, last.view, limits);
+    for registered in registered {
+        let landmarks = scene.views[registered.view].landmark_of.iter();
+        let n_left = landmarks.filter(|l| **l != NONE).count();
         // Landmarks that the adjustment threw out again spoke for a wrong pose.
-        let n_left = scene.views[view]
-            .landmark_of
-            .iter()
-            .filter(|l| **l != NONE)
-            .count();
         if 3 * n_left < 2 * limits.min_inliers {
-            scene.unplace(view);
-            scene.views[view].failed_with = pairs.len();
-            continue;
+            scene.unplace(registered.view);
+            scene.views[registered.view].failed_with = registered.n_pairs;
         }
-        let size = &scene.submaps[submap as usize];
-        if size.views.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 {
-            adjust_global(scene, submap, limits.max_error_px, 8);
-        }
+    }
+    let size = &scene.submaps[last.submap as usize];
+    if size.views.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 {
+        adjust_global(scene, last.submap, limits.max_error_px, 8);
     }
 }
 
