@@ -21,6 +21,9 @@ const MIN_CORNERS: usize = 12;
 const MIN_SURVIVORS: f64 = 0.35;
 /// Tracks are followed forth and back; where they don't return to within this they have slipped.
 const MAX_RETURN_PX: f32 = 1.5;
+/// Corners are followed at most so often: between images that are closer together they hardly move, and following them takes time
+/// that poses need.
+const MAX_FOLLOWED_HZ: f64 = 16.0;
 /// Frames whose median sharpness is the measure.
 const SHARPNESS_WINDOW: usize = 15;
 
@@ -35,6 +38,8 @@ pub struct Selector {
 
 struct LastKeyframe {
     stamp_secs: f64,
+    /// When its corners were followed last.
+    followed_secs: f64,
     n_corners: usize,
     /// (corner in the keyframe, where it is in `newest`).
     tracks: Vec<([f32; 2], [f32; 2])>,
@@ -90,6 +95,12 @@ impl Selector {
         let is_sharp = self.is_sharp(sharpness);
         let stamp_secs = frame.stamp.secs();
         if let Some(last) = &mut self.last {
+            // Stamps that go back are followed at once.
+            let secs = stamp_secs - last.followed_secs;
+            if (0.0..1.0 / MAX_FOLLOWED_HZ).contains(&secs) {
+                return None;
+            }
+            last.followed_secs = stamp_secs;
             let motion = last.follow(grey.clone());
             let too_soon = stamp_secs - last.stamp_secs < 1.0 / self.params.max_rate_hz - 1e-6;
             let moved = match motion {
@@ -137,6 +148,7 @@ impl LastKeyframe {
         let corners = corners(&grey);
         Self {
             stamp_secs,
+            followed_secs: stamp_secs,
             n_corners: corners.len(),
             tracks: corners.into_iter().map(|c| (c, c)).collect(),
             newest: pyramid(grey),

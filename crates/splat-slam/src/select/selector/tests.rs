@@ -160,3 +160,32 @@ fn depth_shows_as_parallax_but_a_turn_does_not() {
     assert!((5.0..7.0).contains(&parallax_flow(&deep)));
     assert_eq!(parallax_flow(&[]), 0.0);
 }
+
+#[test]
+fn a_faster_camera_gives_the_same_keyframes_and_is_not_followed_more_often() {
+    // The same two seconds at 15 and at 60 Hz, 60 px each second.
+    let at_rate = |hz: u32| {
+        let one = move |i: u32| {
+            let secs = f64::from(i) / f64::from(hz);
+            Frame {
+                stamp: Stamp::from_secs(secs),
+                ..frame(u64::from(i), 60.0 * secs, 1.0)
+            }
+        };
+        (0..2 * hz).map(one)
+    };
+    let [slow, fast] = [15, 60].map(|hz| kept(at_rate(hz), params()));
+    assert!(slow.len() >= 4, "{slow:?}");
+    assert_eq!(slow.len(), fast.len(), "{slow:?} {fast:?}");
+    let followed = |hz: u32| {
+        let mut selector = Selector::new(params());
+        let mut stamps = Vec::new();
+        for frame in at_rate(hz) {
+            selector.push(frame);
+            stamps.extend(selector.last.as_ref().map(|last| last.followed_secs));
+        }
+        stamps.dedup();
+        stamps.len()
+    };
+    assert!(followed(60) <= followed(15) + 2, "{}", followed(60));
+}
