@@ -6,7 +6,7 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Keyframes that the first poses are made from: fewer can agree on a wrong place.
-const FIRST: usize = 5;
+const FIRST: usize = 3;
 
 /// Written by geometry, asked by selection.
 #[derive(Debug)]

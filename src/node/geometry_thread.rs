@@ -16,6 +16,11 @@ use splat_types::time::Stopwatch;
 
 /// Live, while depth is worked on: time between looks at whether a batch has come.
 const DEPTH_TICK: Duration = Duration::from_millis(5);
+/// Live, while poses are at work: time between looks at whether they are done, and how old a sweep gets before it waits no more.
+const POSE_TICK: Duration = Duration::from_millis(2);
+const MAX_DEPTH_SECS: f64 = 1.0;
+/// Live: poses that came earlier are improved when no keyframe has come for so long: the next one would wait for it.
+const QUIET_SECS: f64 = 0.1;
 
 pub(crate) struct GeometryStage {
     model: Box<dyn GeometryModel>,
@@ -173,7 +178,10 @@ fn run_live(
     let (jobs_tx, jobs) = queue("depth jobs", 1, WhenFull::Wait);
     let (swept_tx, swept) = queue("depth", 1, WhenFull::Wait);
     std::thread::scope(|scope| {
-        scope.spawn(move || in_own_pool("depth", Niceness::Depth, || run_depth(&jobs, &swept_tx)));
+        scope.spawn(move || {
+            let work = || run_depth(&jobs, &swept_tx, backpressure);
+            in_own_pool("depth", Niceness::Depth, work);
+        });
         let depth = DepthWork {
             jobs: jobs_tx,
             swept,
@@ -190,11 +198,20 @@ struct DepthWork {
     is_at_work: bool,
 }
 
-/// Ends when no more jobs come.
-fn run_depth(jobs: &Receiver<SweepJob>, swept: &Sender<(SweptDepth, f64)>) {
+/// Ends when no more jobs come. Depth waits while poses are at work: beside it, they would take half as long again on few cores.
+fn run_depth(
+    jobs: &Receiver<SweepJob>,
+    swept: &Sender<(SweptDepth, f64)>,
+    backpressure: &Backpressure,
+) {
     while let Some(job) = jobs.recv() {
         let watch = Stopwatch::start();
-        let found = job.run();
+        let give_way = || {
+            while backpressure.is_at_work() && watch.secs() < MAX_DEPTH_SECS {
+                std::thread::sleep(POSE_TICK);
+            }
+        };
+        let found = job.run_giving_way(&give_way);
         if swept.send((found, watch.secs())).is_err() {
             return;
         }
@@ -209,11 +226,14 @@ fn give_poses(
     backpressure: &Backpressure,
 ) -> Option<GeometryError> {
     let mut newest = None;
+    let mut since_batch = Stopwatch::start();
     loop {
-        let geometry = match next(&mut stage, &mut depth, batches) {
+        let is_quiet = since_batch.secs() > QUIET_SECS;
+        let geometry = match next(&mut stage, &mut depth, batches, is_quiet) {
             Next::Answer(geometry) => geometry,
             Next::Batch(batch) => {
                 let reported = stage.sooner(&batch);
+                since_batch = Stopwatch::start();
                 newest = Some(batch);
                 backpressure.note(stage.has_registered);
                 backpressure.done();
@@ -241,39 +261,54 @@ enum Next {
     Ended,
 }
 
-/// A batch that has come, else poses that can be improved, else depth that has been worked out, else whatever comes.
-fn next(stage: &mut GeometryStage, depth: &mut DepthWork, batches: &Receiver<Arc<Batch>>) -> Next {
+/// A batch that has come, else depth that has been worked out, else poses that can be improved while it is quiet, else whatever
+/// comes. Work for the thread of depth is handed out on the way.
+fn next(
+    stage: &mut GeometryStage,
+    depth: &mut DepthWork,
+    batches: &Receiver<Arc<Batch>>,
+    is_quiet: bool,
+) -> Next {
     if let Ok(Some(batch)) = batches.try_recv() {
         return Next::Batch(batch);
     }
-    if let Some(refined) = stage.refine() {
-        let has_changed =
-            refined.is_loop || !(refined.views.is_empty() && refined.revised.is_empty());
-        return if has_changed {
-            Next::Answer(refined)
-        } else {
-            Next::Nothing
-        };
+    if !depth.is_at_work {
+        match stage.depth() {
+            Some(DepthTask::Known(known)) => return Next::Answer(known),
+            Some(DepthTask::Sweep(job)) => depth.is_at_work = depth.jobs.send(*job).is_ok(),
+            None => {}
+        }
+    }
+    let refined = is_quiet.then(|| stage.refine()).flatten();
+    if let Some(refined) = &refined
+        && !refined.is_loop
+        && refined.views.is_empty()
+        && refined.revised.is_empty()
+    {
+        return Next::Nothing;
+    }
+    if let Some(refined) = refined {
+        return Next::Answer(refined);
     }
     if depth.is_at_work {
-        match depth.swept.recv_timeout(DEPTH_TICK) {
+        return match depth.swept.recv_timeout(DEPTH_TICK) {
             Received::Item(swept) => {
                 depth.is_at_work = false;
                 let found = stage.take_depth(swept);
-                return found.map_or(Next::Nothing, Next::Answer);
+                found.map_or(Next::Nothing, Next::Answer)
             }
             // Its thread has died: what it had in hand never comes back.
-            Received::Ended => return Next::Ended,
-            Received::Nothing => return Next::Nothing,
-        }
+            Received::Ended => Next::Ended,
+            Received::Nothing => Next::Nothing,
+        };
     }
-    match stage.depth() {
-        Some(DepthTask::Known(known)) => Next::Answer(known),
-        Some(DepthTask::Sweep(job)) => {
-            depth.is_at_work = depth.jobs.send(*job).is_ok();
-            Next::Nothing
-        }
-        None => batches.recv().map_or(Next::Ended, Next::Batch),
+    if is_quiet {
+        return batches.recv().map_or(Next::Ended, Next::Batch);
+    }
+    match batches.recv_timeout(DEPTH_TICK) {
+        Received::Item(batch) => Next::Batch(batch),
+        Received::Ended => Next::Ended,
+        Received::Nothing => Next::Nothing,
     }
 }
 

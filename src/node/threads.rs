@@ -121,16 +121,16 @@ fn run_select_live(
     stage
 }
 
-/// Who yields to whom where processors are few, as Linux counts it: 0 for everything that a pose waits for. One of
-/// niceness 5 gets a third of the time beside one of 0, one of 8 a sixth.
+/// Who yields to whom where processors are few, as Linux counts it: 0 for everything that a frame's pose waits for. Beside one of
+/// niceness 0, one of 3 gets a third of the time, one of 12 a fifteenth, one of 15 a thirtieth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Niceness {
     /// Poses of keyframes.
-    Geometry = 1,
+    Geometry = 3,
     /// Their depth.
-    Depth = 5,
+    Depth = 12,
     /// Optimiser steps.
-    Steps = 8,
+    Steps = 15,
 }
 
 /// Live: parallel loops of one stage must not wait behind those of another in the pool that all share. They get threads of

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use splat_geometry::answer::GeometryBatch;
 use splat_geometry::model::{DepthTask, GeometryModel};
@@ -126,6 +127,7 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
     let mut known = Known::default();
     // A sweep is at work while the next keyframe is registered.
     let mut at_work: Option<Box<SweepJob>> = None;
+    let n_asked = AtomicUsize::new(0);
     let (start, rest) = keyframes.split_at(5);
     let singles = rest.iter().map(std::slice::from_ref);
     for (id, new) in std::iter::once(start).chain(singles).enumerate() {
@@ -135,7 +137,10 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
         assert!(new.iter().all(|k| views.contains(&k.id)), "batch {id}");
         known.take(&reported);
         if let Some(job) = at_work.take() {
-            known.take(&model.take_depth(job.run()).unwrap());
+            let give_way = || {
+                n_asked.fetch_add(1, Ordering::Relaxed);
+            };
+            known.take(&model.take_depth(job.run_giving_way(&give_way)).unwrap());
         }
         // Every third time there is a moment for what was left.
         if id % 3 == 2 {
@@ -155,6 +160,11 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
     if let Some(job) = at_work.take() {
         known.take(&model.take_depth(job.run()).unwrap());
     }
+    let n_asked = n_asked.into_inner();
+    assert!(
+        n_asked > params.mvs.depth_planes,
+        "sweeps give way: {n_asked}"
+    );
     finish(&mut model, &mut known);
     assert_eq!(known.poses.len(), keyframes.len());
     assert!(

@@ -5,6 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use crate::mvs::gpu::GpuMatcher;
 use crate::mvs::sgm::Winners;
 use crate::mvs::stereo::SweepTask;
+use crate::mvs::sweep::GiveWay;
 use splat_gpu::backend::Backend;
 use splat_gpu::device::Wanted;
 use splat_gpu::error::GpuError;
@@ -28,9 +29,9 @@ impl Matcher {
         })
     }
 
-    pub(crate) fn winners(&mut self, task: &SweepTask<'_>) -> Winners {
+    pub(crate) fn winners(&mut self, task: &SweepTask<'_>, give_way: GiveWay<'_>) -> Winners {
         match std::mem::replace(self, Self::Cpu) {
-            Self::Cpu => task.winners_on_cpu(),
+            Self::Cpu => task.winners_giving_way(give_way),
             Self::Undecided => {
                 // Software Vulkan is slower than native code, so only hardware will do.
                 let (winners, faster) = timed(task, wanted(false));
@@ -45,7 +46,7 @@ impl Matcher {
                 Err(error) => {
                     tracing::warn!("depth is matched on the CPU from here on: {error}");
                     give_up(gpu, &error);
-                    task.winners_on_cpu()
+                    task.winners_giving_way(give_way)
                 }
             },
         }

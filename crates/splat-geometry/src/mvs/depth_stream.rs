@@ -68,13 +68,22 @@ pub struct SweptDepth {
 
 impl SweepJob {
     /// Matches; takes tens to hundreds of milliseconds on a CPU.
-    pub fn run(mut self) -> SweptDepth {
+    pub fn run(self) -> SweptDepth {
+        self.run_giving_way(&|| ())
+    }
+
+    /// The same; on a CPU `give_way` is called every few milliseconds, from all its threads, and may wait.
+    pub fn run_giving_way(mut self, give_way: &(dyn Fn() + Sync)) -> SweptDepth {
         let (near, far) = self.range;
         let (keyframe_id, n_sources) = (self.keyframe_id, self.sources.len());
         tracing::debug!(keyframe_id, n_sources, near, far, "sweep");
         let images: Vec<&Prepared> = self.sources.iter().map(|(_, source)| source).collect();
         let raw = match SweepTask::new(&self.reference, &images, self.range, &self.params) {
-            Some(task) => task.raw_depth(self.matcher.winners(&task)),
+            Some(task) => {
+                let winners = self.matcher.winners(&task, give_way);
+                give_way();
+                task.raw_depth(winners)
+            }
             None => RawDepth::empty(self.reference.intrinsics),
         };
         let source = |(id, source): &(u32, Prepared)| Source {

@@ -202,7 +202,7 @@ impl Pair {
 
 /// Even pixels that have found their depth, by source.
 fn pairs(reference: &Grey, warps: &[Warp<'_>], planes: &Planes) -> Vec<Vec<Pair>> {
-    let costs = matching_costs(reference, warps, planes, 0.0);
+    let costs = matching_costs(reference, warps, planes, 0.0, &|| ());
     let mut pairs = vec![Vec::new(); warps.len()];
     for (ix, costs) in costs.chunks_exact(planes.n).enumerate() {
         let (x, y) = (ix % reference.width, ix / reference.width);

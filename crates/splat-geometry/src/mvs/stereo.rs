@@ -93,12 +93,18 @@ impl<'a> SweepTask<'a> {
     }
 
     pub(crate) fn winners_on_cpu(&self) -> sgm::Winners {
+        self.winners_giving_way(&|| ())
+    }
+
+    pub(crate) fn winners_giving_way(&self, give_way: sweep::GiveWay<'_>) -> sgm::Winners {
         let costs = sweep::matching_costs(
             &self.reference.grey,
             &self.warps,
             &self.planes,
             zncc::OWN_SHARE,
+            give_way,
         );
+        give_way();
         sgm::best_planes(&self.reference.grey, &costs, self.planes.n)
     }
 

@@ -12,12 +12,17 @@ use crate::mvs::planes::Planes;
 use crate::mvs::warp::Warp;
 use crate::mvs::zncc::{Statistics, plane_costs};
 
+/// Waits while something that is more urgent than depth is at work.
+pub(crate) type GiveWay<'a> = &'a (dyn Fn() + Sync);
+
 /// Cost 0 (perfect) to 255, `[y][x][plane]`. `own_share`: of a score, what the pixel itself says; the rest is ZNCC.
+/// `give_way` is called before each plane, some milliseconds apart, and may wait.
 pub(crate) fn matching_costs(
     reference: &Grey,
     warps: &[Warp<'_>],
     planes: &Planes,
     own_share: f32,
+    give_way: GiveWay<'_>,
 ) -> Vec<u8> {
     let n_pixels = reference.width * reference.height;
     let statistics = Statistics::of(reference);
@@ -26,6 +31,7 @@ pub(crate) fn matching_costs(
         .par_chunks_mut(n_pixels)
         .enumerate()
         .for_each(|(plane, costs)| {
+            give_way();
             plane_costs(
                 reference,
                 &statistics,

@@ -36,10 +36,13 @@ const MIN_NEW_SUBMAP: usize = 4;
 const MAX_WAITING: usize = 64;
 /// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
 const MAX_IMAGES: usize = 128;
-/// Live: views that may wait for what they have seen long ago to be looked for. Of more, the oldest do without.
-const MAX_BEHIND: usize = 16;
-/// Live: when so many keyframes have gathered, each is matched with fewer of those before it, so that the next ones wait less.
-const MANY_NEW: usize = 3;
+/// Live: views that may wait for what they have seen long ago to be looked for, as many as links that agree on a loop may lie
+/// apart. Of more, the oldest do without.
+const MAX_BEHIND: usize = 24;
+/// Live: when so many keyframes have gathered, each gets less effort, so that the next ones wait less: so large a share of
+/// `sfm.max_features`, and matches with so many keyframes before it.
+const MANY_NEW: usize = 2;
+const FEATURES_OF_MANY: f64 = 0.65;
 const N_LAST_OF_MANY: usize = 4;
 /// Steps of the adjustment of a submap that has grown.
 const N_GROWN_STEPS: usize = 8;
@@ -61,6 +64,14 @@ pub struct Sfm {
     is_loop: bool,
     /// Live: views that are not yet compared with those long before them.
     behind: Vec<usize>,
+}
+
+/// What is done for each new keyframe.
+#[derive(Clone, Copy)]
+struct Effort {
+    max_features: usize,
+    /// Keyframes just before it that it is matched with.
+    n_last: usize,
 }
 
 impl Sfm {
@@ -95,16 +106,23 @@ impl Sfm {
         self.batch_id = batch.id;
         let first_new = self.scene.views.len();
         let n_new = batch.keyframes.len().saturating_sub(batch.n_shared);
-        let n_last = if n_new >= MANY_NEW {
-            N_LAST_OF_MANY
+        let effort = if n_new >= MANY_NEW {
+            Effort {
+                max_features: (self.sfm.max_features as f64 * FEATURES_OF_MANY) as usize,
+                n_last: N_LAST_OF_MANY,
+            }
         } else {
-            usize::MAX
+            Effort {
+                max_features: self.sfm.max_features,
+                n_last: usize::MAX,
+            }
         };
-        let limits = self.take_in_with(&batch.keyframes, |scene, newest, max_error_px, seed| {
-            link_last(scene, newest, n_last, max_error_px, seed);
-        });
+        let link = |scene: &mut Reconstruction, newest, max_error_px, seed| {
+            link_last(scene, newest, effort.n_last, max_error_px, seed);
+        };
+        let limits = self.take_in_with(&batch.keyframes, effort.max_features, link);
         self.behind.extend(first_new..self.scene.views.len());
-        let fresh = self.behind.clone();
+        let fresh: Vec<usize> = (first_new..self.scene.views.len()).collect();
         grow_at_once(&mut self.scene, &fresh, &limits);
         let is_missing = |ix: &usize| self.scene.views[*ix].registered.is_none();
         let missing: Vec<usize> = fresh.into_iter().filter(is_missing).collect();
@@ -200,13 +218,14 @@ impl Sfm {
             link_recent(scene, newest, max_error_px, seed);
             link_older(scene, newest, max_error_px, seed);
         };
-        self.take_in_with(keyframes, link)
+        self.take_in_with(keyframes, self.sfm.max_features, link)
     }
 
     /// Makes views of the keyframes that are new, and calls `link` with each, the limit of errors and a seed.
     fn take_in_with(
         &mut self,
         keyframes: &[Arc<Keyframe>],
+        max_features: usize,
         link: impl Fn(&mut Reconstruction, usize, f64, u64),
     ) -> Limits {
         let limits = self.limits(keyframes);
@@ -217,7 +236,7 @@ impl Sfm {
         let looked = |keyframe: &&Arc<Keyframe>| {
             let image = working_image(&keyframe.frame.image, self.sfm.max_side);
             (
-                self.finder.features(&image, self.sfm.max_features),
+                self.finder.features(&image, max_features),
                 (image.width as u32, image.height as u32),
             )
         };

@@ -172,6 +172,7 @@ fn check_scene(scene: &(MvsView, Vec<MvsView>), n_depths: usize, range: (f64, f6
             &task.warps,
             &task.planes,
             zncc::OWN_SHARE,
+            &|| (),
         );
         let (winners, on_gpu) = with_gpu(|gpu| (gpu.winners(task).unwrap(), gpu.costs(task)));
         assert_eq!(on_gpu.len(), on_cpu.len());
@@ -355,12 +356,12 @@ fn a_device_lost_in_the_middle_of_a_run_costs_no_depth() {
     let params = params(32, 2);
     with_task(&scene((64, 48), 2), RANGE, &params, |task| {
         let mut matcher = Matcher::new(Backend::Wgpu).unwrap();
-        matcher.winners(task);
+        matcher.winners(task, &|| ());
         let Matcher::Gpu(gpu) = &matcher else {
             panic!("a GPU was asked for");
         };
         gpu.lose();
-        let found = matcher.winners(task);
+        let found = matcher.winners(task, &|| ());
         assert_eq!(found.plane, task.winners_on_cpu().plane);
         assert!(matches!(matcher, Matcher::Cpu), "it does not try again");
     });
