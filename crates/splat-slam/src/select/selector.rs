@@ -23,7 +23,7 @@ const MIN_SURVIVORS: f64 = 0.35;
 const MAX_RETURN_PX: f32 = 1.5;
 /// Corners are followed at most so often: between images that are closer together they hardly move, and following them takes time
 /// that poses need.
-const MAX_FOLLOWED_HZ: f64 = 16.0;
+const MAX_FOLLOWED_HZ: f64 = 21.0;
 /// Frames whose median sharpness is the measure.
 const SHARPNESS_WINDOW: usize = 15;
 
