@@ -131,8 +131,12 @@ impl Grey {
 
     /// Blurred by a Gaussian.
     pub fn blurred(&self, sigma: f32) -> Self {
+        self.blurred_into(vec![0.0_f32; self.pixels.len()], sigma)
+    }
+
+    /// The same in memory of as many pixels.
+    fn blurred_into(&self, mut pixels: Vec<f32>, sigma: f32) -> Self {
         let kernel = half_gaussian(sigma);
-        let mut pixels = vec![0.0_f32; self.pixels.len()];
         let rows = pixels.par_chunks_mut(self.width).enumerate();
         rows.for_each_init(Vec::new, |padded, (y, out)| {
             self.blur_row(y, &kernel, padded, out);
@@ -191,7 +195,7 @@ impl Grey {
 pub fn pyramid(image: &Grey, spare: &SpareMemory) -> (Vec<Octave>, Vec<Blob>) {
     let first = image.doubled(spare);
     let sigma = (BASE_SIGMA.powi(2) - (2.0 * CAMERA_SIGMA).powi(2)).sqrt();
-    let mut base = first.blurred(sigma);
+    let mut base = first.blurred_into(spare.take(first.pixels.len()), sigma);
     spare.keep([first]);
     let (mut octaves, mut found) = (Vec::new(), Vec::new());
     let mut step = 0.5;
