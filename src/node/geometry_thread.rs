@@ -8,9 +8,9 @@ use crate::node::threads::{Answer, Niceness, in_own_pool};
 use crate::params::params::Params;
 use splat_geometry::answer::GeometryBatch;
 use splat_geometry::error::GeometryError;
-use splat_geometry::model::{DepthTask, GeometryModel};
+use splat_geometry::model::{DepthTask, GeometryModel, Work};
 use splat_geometry::mvs::depth_stream::{SweepJob, SweptDepth};
-use splat_io::queue::{Received, Receiver, Sender, WhenFull, queue};
+use splat_io::queue::{Ended, Received, Receiver, Sender, WhenFull, queue};
 use splat_types::frame::Batch;
 use splat_types::time::Stopwatch;
 
@@ -21,6 +21,10 @@ const POSE_TICK: Duration = Duration::from_millis(2);
 const MAX_DEPTH_SECS: f64 = 1.0;
 /// Live: poses that came earlier are improved when no keyframe has come for so long: the next one would wait for it.
 const QUIET_SECS: f64 = 0.1;
+
+/// Live: all keyframes are adjusted together again after so many times as long as that took, so that it takes one part of five of a
+/// processor at most, however large the map is.
+const REST_PER_ADJUSTMENT: f64 = 4.0;
 
 pub(crate) struct GeometryStage {
     model: Box<dyn GeometryModel>,
@@ -84,6 +88,27 @@ impl GeometryStage {
         let refined = self.model.refine();
         self.lock().secs += watch.secs();
         refined
+    }
+
+    /// The adjustment of all keyframes as work for another thread.
+    fn adjustment(&mut self) -> Option<Work> {
+        let watch = Stopwatch::start();
+        let work = self.model.adjustment();
+        self.lock().secs += watch.secs();
+        work
+    }
+
+    /// What that work has found in so many seconds.
+    fn take_adjustment(&mut self, secs: f64) -> Option<GeometryBatch> {
+        let watch = Stopwatch::start();
+        let found = self.model.take_adjustment();
+        let own_secs = watch.secs();
+        tracing::debug!(
+            is_used = found.is_some(),
+            "all keyframes adjusted in {secs:.2} s, taken over in {own_secs:.2} s"
+        );
+        self.lock().secs += own_secs + secs;
+        found
     }
 
     /// Depth of one more keyframe, or the work that it takes.
@@ -177,25 +202,71 @@ fn run_live(
     let _ending = Ending(backpressure);
     let (jobs_tx, jobs) = queue("depth jobs", 1, WhenFull::Wait);
     let (swept_tx, swept) = queue("depth", 1, WhenFull::Wait);
+    let (work_tx, work) = queue("adjustments", 1, WhenFull::Wait);
+    let (adjusted_tx, adjusted) = queue("adjusted", 1, WhenFull::Wait);
     std::thread::scope(|scope| {
         scope.spawn(move || {
             let work = || run_depth(&jobs, &swept_tx, backpressure);
             in_own_pool("depth", Niceness::Depth, work);
         });
-        let depth = DepthWork {
-            jobs: jobs_tx,
-            swept,
-            is_at_work: false,
+        scope.spawn(move || {
+            let work = || run_adjustment(&work, &adjusted_tx);
+            in_own_pool("adjust", Niceness::Adjustment, work);
+        });
+        let beside = Beside {
+            depth: Worker::new(jobs_tx, swept),
+            adjustment: Worker::new(work_tx, adjusted),
+            adjusted: None,
         };
-        give_poses(stage, depth, batches, answers, backpressure)
+        give_poses(stage, beside, batches, answers, backpressure)
     })
 }
 
-/// The thread that works out depth, seen from the one of poses.
-struct DepthWork {
-    jobs: Sender<SweepJob>,
-    swept: Receiver<(SweptDepth, f64)>,
+/// A thread that works for the one of poses, seen from there: one job at a time.
+struct Worker<Job, Done> {
+    jobs: Sender<Job>,
+    done: Receiver<Done>,
     is_at_work: bool,
+}
+
+impl<Job, Done> Worker<Job, Done> {
+    fn new(jobs: Sender<Job>, done: Receiver<Done>) -> Self {
+        Self {
+            jobs,
+            done,
+            is_at_work: false,
+        }
+    }
+
+    fn begin(&mut self, job: Job) {
+        self.is_at_work = self.jobs.send(job).is_ok();
+    }
+
+    /// What it has done, if it has; an error once the thread has died: what it had in hand never comes back.
+    fn take(&mut self) -> Result<Option<Done>, Ended> {
+        let done = self.done.try_recv()?;
+        self.is_at_work &= done.is_none();
+        Ok(done)
+    }
+}
+
+/// What goes on beside poses.
+struct Beside {
+    depth: Worker<SweepJob, (SweptDepth, f64)>,
+    adjustment: Worker<Work, f64>,
+    /// Since when the last adjustment is done, and how many seconds it took.
+    adjusted: Option<(Stopwatch, f64)>,
+}
+
+/// Ends when no more work comes.
+fn run_adjustment(work: &Receiver<Work>, adjusted: &Sender<f64>) {
+    while let Some(work) = work.recv() {
+        let watch = Stopwatch::start();
+        work();
+        if adjusted.send(watch.secs()).is_err() {
+            return;
+        }
+    }
 }
 
 /// Ends when no more jobs come. Depth waits while poses are at work: beside it, they would take half as long again on few cores.
@@ -220,7 +291,7 @@ fn run_depth(
 
 fn give_poses(
     mut stage: GeometryStage,
-    mut depth: DepthWork,
+    mut beside: Beside,
     batches: &Receiver<Arc<Batch>>,
     answers: &Sender<Answer>,
     backpressure: &Backpressure,
@@ -229,7 +300,7 @@ fn give_poses(
     let mut since_batch = Stopwatch::start();
     loop {
         let is_quiet = since_batch.secs() > QUIET_SECS;
-        let geometry = match next(&mut stage, &mut depth, batches, is_quiet) {
+        let geometry = match next(&mut stage, &mut beside, batches, is_quiet) {
             Next::Answer(geometry) => geometry,
             Next::Batch(batch) => {
                 let reported = stage.sooner(&batch);
@@ -261,54 +332,87 @@ enum Next {
     Ended,
 }
 
-/// A batch that has come, else depth that has been worked out, else poses that can be improved while it is quiet, else whatever
-/// comes. Work for the thread of depth is handed out on the way.
+/// A batch that has come, else what other threads have worked out, else poses that can be improved while it is quiet, else whatever
+/// comes. Work for the other threads is handed out on the way.
 fn next(
     stage: &mut GeometryStage,
-    depth: &mut DepthWork,
+    beside: &mut Beside,
     batches: &Receiver<Arc<Batch>>,
     is_quiet: bool,
 ) -> Next {
     if let Ok(Some(batch)) = batches.try_recv() {
         return Next::Batch(batch);
     }
-    if !depth.is_at_work {
-        match stage.depth() {
-            Some(DepthTask::Known(known)) => return Next::Answer(known),
-            Some(DepthTask::Sweep(job)) => depth.is_at_work = depth.jobs.send(*job).is_ok(),
-            None => {}
-        }
+    match beside.next(stage) {
+        Next::Nothing => {}
+        other => return other,
     }
-    let refined = is_quiet.then(|| stage.refine()).flatten();
-    if let Some(refined) = &refined
-        && !refined.is_loop
-        && refined.views.is_empty()
-        && refined.revised.is_empty()
-    {
-        return Next::Nothing;
-    }
-    if let Some(refined) = refined {
-        return Next::Answer(refined);
-    }
-    if depth.is_at_work {
-        return match depth.swept.recv_timeout(DEPTH_TICK) {
-            Received::Item(swept) => {
-                depth.is_at_work = false;
-                let found = stage.take_depth(swept);
-                found.map_or(Next::Nothing, Next::Answer)
-            }
-            // Its thread has died: what it had in hand never comes back.
-            Received::Ended => Next::Ended,
-            Received::Nothing => Next::Nothing,
+    if let Some(refined) = is_quiet.then(|| stage.refine()).flatten() {
+        let is_empty = refined.views.is_empty() && refined.revised.is_empty();
+        return if is_empty && !refined.is_loop {
+            Next::Nothing
+        } else {
+            Next::Answer(refined)
         };
     }
-    if is_quiet {
+    if is_quiet && !beside.is_at_work() && beside.may_adjust() {
         return batches.recv().map_or(Next::Ended, Next::Batch);
     }
     match batches.recv_timeout(DEPTH_TICK) {
         Received::Item(batch) => Next::Batch(batch),
+        // Depth that is begun is worth waiting for; all keyframes are adjusted together once more in any case.
+        Received::Ended if beside.depth.is_at_work => {
+            std::thread::sleep(DEPTH_TICK);
+            Next::Nothing
+        }
         Received::Ended => Next::Ended,
         Received::Nothing => Next::Nothing,
+    }
+}
+
+impl Beside {
+    fn is_at_work(&self) -> bool {
+        self.depth.is_at_work || self.adjustment.is_at_work
+    }
+
+    /// What a thread has found; otherwise gives those work that have none.
+    fn next(&mut self, stage: &mut GeometryStage) -> Next {
+        if self.adjustment.is_at_work {
+            match self.adjustment.take() {
+                Ok(Some(secs)) => {
+                    self.adjusted = Some((Stopwatch::start(), secs));
+                    if let Some(found) = stage.take_adjustment(secs) {
+                        return Next::Answer(found);
+                    }
+                }
+                Ok(None) => {}
+                Err(Ended) => return Next::Ended,
+            }
+        } else if self.may_adjust()
+            && let Some(work) = stage.adjustment()
+        {
+            self.adjustment.begin(work);
+        }
+        if self.depth.is_at_work {
+            return match self.depth.take() {
+                Ok(swept) => {
+                    let found = swept.and_then(|swept| stage.take_depth(swept));
+                    found.map_or(Next::Nothing, Next::Answer)
+                }
+                Err(Ended) => Next::Ended,
+            };
+        }
+        match stage.depth() {
+            Some(DepthTask::Known(known)) => return Next::Answer(known),
+            Some(DepthTask::Sweep(job)) => self.depth.begin(*job),
+            None => {}
+        }
+        Next::Nothing
+    }
+
+    fn may_adjust(&self) -> bool {
+        self.adjusted
+            .is_none_or(|(since, secs)| since.secs() >= REST_PER_ADJUSTMENT * secs)
     }
 }
 

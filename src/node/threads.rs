@@ -127,6 +127,8 @@ fn run_select_live(
 pub(crate) enum Niceness {
     /// Poses of keyframes.
     Geometry = 3,
+    /// The adjustment of all together.
+    Adjustment = 8,
     /// Their depth.
     Depth = 12,
     /// Optimiser steps.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use splat_geometry::answer::GeometryBatch;
-use splat_geometry::model::{DepthTask, GeometryModel};
+use splat_geometry::model::{DepthTask, GeometryModel, Work};
 use splat_geometry::mvs::depth_stream::SweepJob;
 use splat_geometry::sfm::estimator::Sfm;
 use splat_geometry::similarity;
@@ -127,6 +127,9 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
     let mut known = Known::default();
     // A sweep is at work while the next keyframe is registered.
     let mut at_work: Option<Box<SweepJob>> = None;
+    // So is the adjustment of all, from one moment to the next.
+    let mut adjusting: Option<Work> = None;
+    let mut n_adjusted = 0;
     let n_asked = AtomicUsize::new(0);
     let (start, rest) = keyframes.split_at(5);
     let singles = rest.iter().map(std::slice::from_ref);
@@ -147,6 +150,13 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
             let slices: Vec<_> = std::iter::from_fn(|| model.refine()).take(20).collect();
             assert!((2..20).contains(&slices.len()), "a slice for each view");
             slices.iter().for_each(|slice| known.take(slice));
+            if let Some(work) = adjusting.take() {
+                work();
+                let adjusted = model.take_adjustment();
+                n_adjusted += usize::from(adjusted.is_some());
+                adjusted.iter().for_each(|adjusted| known.take(adjusted));
+            }
+            adjusting = model.adjustment();
         }
         match model.depth() {
             Some(DepthTask::Sweep(job)) => {
@@ -165,6 +175,7 @@ fn poses_come_first_and_what_comes_later_makes_the_same_map() {
         n_asked > params.mvs.depth_planes,
         "sweeps give way: {n_asked}"
     );
+    assert!(n_adjusted >= 1 && model.take_adjustment().is_none());
     finish(&mut model, &mut known);
     assert_eq!(known.poses.len(), keyframes.len());
     assert!(

@@ -13,6 +13,9 @@ pub enum DepthTask {
     Sweep(Box<SweepJob>),
 }
 
+/// Work for another thread, whose outcome the model keeps for itself.
+pub type Work = Box<dyn FnOnce() + Send>;
+
 /// Estimates cameras and depth. One thread owns it; calls come in order of batches.
 pub trait GeometryModel: Send {
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError>;
@@ -27,6 +30,17 @@ pub trait GeometryModel: Send {
 
     /// Live, while no batch waits: poses that are better by what `poses` left for later; `None` where nothing was left.
     fn refine(&mut self) -> Option<GeometryBatch> {
+        None
+    }
+
+    /// Live: better poses of all keyframes as long work for another thread; `take_adjustment` when it has run. `None` while there is
+    /// no need.
+    fn adjustment(&mut self) -> Option<Work> {
+        None
+    }
+
+    /// What the work that `adjustment` handed out has found, for the keyframes of before and of since.
+    fn take_adjustment(&mut self) -> Option<GeometryBatch> {
         None
     }
 

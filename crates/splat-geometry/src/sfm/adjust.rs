@@ -83,13 +83,7 @@ pub(crate) fn adjust_global(
     let views = scene.submaps[submap as usize].views.clone();
     let Some(&first) = views.first() else { return };
     let before = spread(scene, first, &views);
-    let moves = Moves {
-        free: &views[1..],
-        soft: &[],
-        lens: views.len() >= MIN_FOCAL_VIEWS,
-        max_steps,
-    };
-    run(scene, &moves, max_error_px);
+    run(scene, &of_all(&views, max_steps), max_error_px);
     // With one camera held the scale is free; it would drift from one adjustment to the next.
     if let Some(centre) = scene.centre(first) {
         let mut ratios: Vec<f64> = spread(scene, first, &views)
@@ -108,6 +102,17 @@ pub(crate) fn adjust_global(
         }
     }
     scene.submaps[submap as usize].n_adjusted = views.len();
+    scene.n_rebuilt += 1;
+}
+
+/// All views of a submap but the first, which holds the frame.
+fn of_all(views: &[usize], max_steps: usize) -> Moves<'_> {
+    Moves {
+        free: &views[1..],
+        soft: &[],
+        lens: views.len() >= MIN_FOCAL_VIEWS,
+        max_steps,
+    }
 }
 
 fn spread(scene: &Reconstruction, first: usize, views: &[usize]) -> Vec<f64> {
@@ -134,19 +139,66 @@ pub(crate) fn median_error_px(scene: &Reconstruction, views: &[usize]) -> f64 {
     median(&mut errors).unwrap_or(0.0)
 }
 
+/// Bundle adjustment of a part of the scene, apart from it.
+#[derive(Debug)]
+pub(crate) struct AdjustTask {
+    pub(crate) problem: Problem,
+    /// The view of each camera, and the landmark of each point.
+    pub(crate) views: Vec<usize>,
+    pub(crate) landmarks: Vec<u32>,
+    /// Whether the lens of uncalibrated views may change.
+    pub(crate) moves_lens: bool,
+    settings: Settings,
+    least_bend_px: f64,
+}
+
+impl AdjustTask {
+    fn of(scene: &Reconstruction, moves: &Moves<'_>, max_error_px: f64) -> Self {
+        let landmarks = scene.landmarks_of(moves.free);
+        let loss_px = LOSS_SHARE * max_error_px;
+        let (problem, views) = problem(scene, moves, &landmarks, loss_px);
+        // One that is found keeps its lens more easily than it got it: near the limit it would come and go.
+        let share = if scene.radial == 0.0 { 1.0 } else { 0.5 };
+        Self {
+            problem,
+            views,
+            landmarks,
+            moves_lens: moves.lens,
+            settings: Settings {
+                max_steps: moves.max_steps,
+                loss_px,
+                refine_focal: moves.lens,
+                refine_radial: moves.lens,
+            },
+            least_bend_px: share * max_error_px,
+        }
+    }
+
+    /// That of a whole submap, but for its first view.
+    pub(crate) fn of_submap(
+        scene: &Reconstruction,
+        submap: u32,
+        max_error_px: f64,
+        max_steps: usize,
+    ) -> Self {
+        let views = &scene.submaps[submap as usize].views;
+        Self::of(scene, &of_all(views, max_steps), max_error_px)
+    }
+
+    pub(crate) fn solve(&mut self) {
+        adjust_lens(&mut self.problem, &self.settings, self.least_bend_px);
+    }
+}
+
 fn run(scene: &mut Reconstruction, moves: &Moves<'_>, max_error_px: f64) {
-    let landmarks = scene.landmarks_of(moves.free);
-    let loss_px = LOSS_SHARE * max_error_px;
-    let (mut problem, views) = problem(scene, moves, &landmarks, loss_px);
-    let settings = Settings {
-        max_steps: moves.max_steps,
-        loss_px,
-        refine_focal: moves.lens,
-        refine_radial: moves.lens,
-    };
-    // One that is found keeps its lens more easily than it got it: near the limit it would come and go.
-    let share = if scene.radial == 0.0 { 1.0 } else { 0.5 };
-    adjust_lens(&mut problem, &settings, share * max_error_px);
+    let mut task = AdjustTask::of(scene, moves, max_error_px);
+    task.solve();
+    let AdjustTask {
+        problem,
+        views,
+        landmarks,
+        ..
+    } = task;
     for (&view, camera) in views.iter().zip(&problem.cameras) {
         if let Some(registered) = &mut scene.views[view].registered {
             registered.cam_from_world = camera.cam_from_world;
@@ -256,7 +308,7 @@ fn corner_bend_px(camera: &Camera) -> f64 {
 }
 
 /// One camera took all uncalibrated views, so all change alike.
-fn share_lens(scene: &mut Reconstruction, factor: f64, radial: f64) {
+pub(crate) fn share_lens(scene: &mut Reconstruction, factor: f64, radial: f64) {
     for view in scene.views.iter_mut().filter(|s| !s.is_calibrated) {
         view.lens = view.lens.refocused(factor);
     }

@@ -175,6 +175,7 @@ fn close(scene: &mut Reconstruction, links: &[&Candidate], limits: &Limits) -> b
     let Some(submap) = scene.submap_of(links[0].ends.1) else {
         return false;
     };
+    scene.n_rebuilt += 1;
     let backup = Backup::of(scene);
     let before = n_observations(scene, submap);
     let is_distorted = bend(scene, submap, links);

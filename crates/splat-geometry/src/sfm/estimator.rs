@@ -1,6 +1,6 @@
 //! The embedded geometry model: batches of keyframes -> poses and landmarks, then depth by stereo.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
@@ -9,13 +9,14 @@ use crate::error::GeometryError;
 use crate::features::descriptor::{Features, working_image, working_size};
 use crate::features::extractor::FeatureExtractor;
 use crate::matching::PreparedDescriptors;
-use crate::model::{DepthTask, GeometryModel};
+use crate::model::{DepthTask, GeometryModel, Work};
 use crate::mvs::depth_stream::SweptDepth;
 use crate::mvs::params::MvsParams;
 use crate::sfm::adjust::adjust_global;
 use crate::sfm::calibrate::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use crate::sfm::close_loops::{release_waiting, settle};
 use crate::sfm::dense_depth::{Densifier, NextDepth};
+use crate::sfm::global_adjustment::{AdjustedSubmap, GlobalAdjustment};
 use crate::sfm::initialize::{Start, start};
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::merge;
@@ -64,6 +65,10 @@ pub struct Sfm {
     is_loop: bool,
     /// Live: views that are not yet compared with those long before them.
     behind: Vec<usize>,
+    /// Poses come by `sparse_soon`, until the end: submaps are adjusted as a whole by `GlobalAdjustment`.
+    is_live: bool,
+    /// What the newest of those has found.
+    adjusted: Arc<Mutex<Option<AdjustedSubmap>>>,
 }
 
 /// What is done for each new keyframe.
@@ -88,6 +93,8 @@ impl Sfm {
             last_start: None,
             is_loop: false,
             behind: Vec::new(),
+            is_live: false,
+            adjusted: Arc::default(),
         })
     }
 
@@ -104,6 +111,7 @@ impl Sfm {
     /// to register the new keyframes.
     fn sparse_soon(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
+        self.is_live = true;
         let first_new = self.scene.views.len();
         let n_new = batch.keyframes.len().saturating_sub(batch.n_shared);
         let effort = if n_new >= MANY_NEW {
@@ -129,7 +137,7 @@ impl Sfm {
         if !missing.is_empty() {
             self.behind.retain(|ix| !missing.contains(ix));
             self.link_older(&missing, &limits);
-            self.catch_up(&limits);
+            self.place_newest(&limits);
         }
         // Their neighbours stand for those that no time was left for.
         let n_left_out = self.behind.len().saturating_sub(MAX_BEHIND);
@@ -138,20 +146,37 @@ impl Sfm {
         self.report(&shared)
     }
 
-    /// Some of what `sparse_soon` has left, in slices, since new keyframes wait meanwhile: what one view has seen long ago,
-    /// or the adjustment of one submap. `None`: nothing is left.
+    /// Some of what `sparse_soon` has left, in slices, since new keyframes wait meanwhile: what one view has seen long ago.
+    /// `None`: nothing is left.
     fn refined(&mut self) -> Option<SparseBatch> {
-        let newest = self.scene.views.last().map(|v| Arc::clone(&v.keyframe));
-        let limits = self.limits(newest.as_slice());
         if self.behind.is_empty() {
-            let grown = self.grown().next()?;
-            adjust_global(&mut self.scene, grown, limits.max_error_px, N_GROWN_STEPS);
-        } else {
-            let next = self.behind.remove(0);
-            self.link_older(&[next], &limits);
-            self.place_newest(&limits);
+            return None;
         }
+        let limits = self.newest_limits();
+        let next = self.behind.remove(0);
+        self.link_older(&[next], &limits);
+        self.place_newest(&limits);
         Some(self.report(&[]))
+    }
+
+    /// The adjustment of a submap that has grown, for another thread.
+    fn next_adjustment(&mut self) -> Option<GlobalAdjustment> {
+        let grown = self.grown().next()?;
+        let max_error_px = self.newest_limits().max_error_px;
+        GlobalAdjustment::of(&mut self.scene, grown, max_error_px, N_GROWN_STEPS)
+    }
+
+    fn take_adjusted(&mut self) -> Option<SparseBatch> {
+        let adjusted = self.adjusted.lock();
+        let adjusted = adjusted.unwrap_or_else(PoisonError::into_inner).take()?;
+        let limits = self.newest_limits();
+        let is_applied = adjusted.apply(&mut self.scene, &limits);
+        is_applied.then(|| self.report(&[]))
+    }
+
+    fn newest_limits(&self) -> Limits {
+        let newest = self.scene.views.last().map(|v| Arc::clone(&v.keyframe));
+        self.limits(newest.as_slice())
     }
 
     /// Registers what waits by all links, closes loops, and adjusts what has grown.
@@ -176,6 +201,7 @@ impl Sfm {
 
     /// Last chance for what waits, then all is adjusted together.
     pub fn finish_sparse(&mut self) -> SparseBatch {
+        self.is_live = false;
         let keyframes: Vec<Arc<Keyframe>> = self
             .scene
             .views
@@ -283,6 +309,7 @@ impl Sfm {
             min_inliers: self.sfm.min_inliers,
             min_parallax_deg: self.sfm.min_parallax_deg,
             local_ba_prior: self.sfm.local_ba_prior,
+            is_global_deferred: self.is_live,
             seed: self.seed,
         }
     }
@@ -448,6 +475,21 @@ impl GeometryModel for Sfm {
 
     fn refine(&mut self) -> Option<GeometryBatch> {
         let sparse = self.refined()?;
+        let scene = &self.scene;
+        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+    }
+
+    fn adjustment(&mut self) -> Option<Work> {
+        let work = self.next_adjustment()?;
+        let found = Arc::clone(&self.adjusted);
+        Some(Box::new(move || {
+            let adjusted = work.run();
+            *found.lock().unwrap_or_else(PoisonError::into_inner) = Some(adjusted);
+        }))
+    }
+
+    fn take_adjustment(&mut self) -> Option<GeometryBatch> {
+        let sparse = self.take_adjusted()?;
         let scene = &self.scene;
         Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
     }

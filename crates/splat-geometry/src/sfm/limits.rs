@@ -9,5 +9,7 @@ pub(crate) struct Limits {
     pub(crate) min_inliers: usize,
     pub(crate) min_parallax_deg: f64,
     pub(crate) local_ba_prior: LocalBaPrior,
+    /// Live: large submaps are adjusted as a whole by another thread (`GlobalAdjustment`).
+    pub(crate) is_global_deferred: bool,
     pub(crate) seed: u64,
 }

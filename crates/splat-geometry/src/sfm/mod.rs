@@ -12,6 +12,8 @@ mod landmarks;
 
 mod adjust;
 
+pub mod global_adjustment;
+
 mod pairwise;
 
 mod merge_submaps;

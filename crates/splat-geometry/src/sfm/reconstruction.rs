@@ -104,6 +104,8 @@ pub(crate) struct Reconstruction {
     /// The same when the matches were verified.
     pub(crate) linked_with: f64,
     pub(crate) undistorted: Undistorted,
+    /// Grows when a submap is adjusted as a whole, merged or dissolved, or a loop is closed.
+    pub(crate) n_rebuilt: u64,
 }
 
 impl Reconstruction {
@@ -291,6 +293,7 @@ impl Reconstruction {
 
     /// Takes a submap apart again: its views wait, its landmarks go.
     pub(crate) fn dissolve(&mut self, submap: u32) {
+        self.n_rebuilt += 1;
         let views = std::mem::take(&mut self.submaps[submap as usize].views);
         for landmark in self.landmarks_of(&views) {
             self.retain_observations(landmark, |_| false);

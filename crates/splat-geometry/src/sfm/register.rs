@@ -13,6 +13,8 @@ use crate::sfm::reconstruction::{NONE, Reconstruction};
 const MIN_SHARE: f64 = 0.25;
 /// Growth of a submap after which all its views are adjusted together.
 const GLOBAL_GROWTH: f64 = 1.3;
+/// Of fewer views that takes no longer than a few keyframes do, so that it is never left to another thread.
+const MAX_SMALL: usize = 24;
 /// A view whose landmarks all lie in a smaller part of the image (standard deviation as a share of the longer
 /// side) could slide or turn freely.
 const MIN_SPREAD: f64 = 0.03;
@@ -77,7 +79,8 @@ fn adjust_about(scene: &mut Reconstruction, registered: &[Registered], limits: &
         }
     }
     let size = &scene.submaps[last.submap as usize];
-    if size.views.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 {
+    let is_deferred = limits.is_global_deferred && size.views.len() > MAX_SMALL;
+    if size.views.len() as f64 >= GLOBAL_GROWTH * size.n_adjusted as f64 && !is_deferred {
         adjust_global(scene, last.submap, limits.max_error_px, 8);
     }
 }

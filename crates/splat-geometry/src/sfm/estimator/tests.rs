@@ -181,6 +181,85 @@ fn a_cloud_seen_along_an_arc_is_rebuilt() {
     );
 }
 
+/// The reconstruction of an arc, whose poses and landmarks were pushed about: all but those of the first view.
+fn disturbed(poses: &[Rigid]) -> Sfm {
+    let (mut sfm, _) = run(&mut cloud(), poses, Some(camera()));
+    let first = sfm.scene.submaps[0].views[0];
+    let mut rng = Pcg32::seed_from_u64(3);
+    let mut push = |size: f64| DVec3::from_array([(); 3].map(|()| rng.random_range(-size..size)));
+    for (ix, view) in sfm.scene.views.iter_mut().enumerate() {
+        if let Some(registered) = view.registered.as_mut().filter(|_| ix != first) {
+            let motion = Rigid::exp(push(0.004), push(0.002));
+            registered.cam_from_world = motion * registered.cam_from_world;
+        }
+    }
+    for landmark in &mut sfm.scene.landmarks {
+        landmark.point += push(0.004);
+    }
+    sfm
+}
+
+fn errors(sfm: &mut Sfm, truth: &[Rigid]) -> (f64, f64) {
+    sfm.reported = Reported::default();
+    worst(&sfm.report(&[]), truth)
+}
+
+#[test]
+fn all_are_adjusted_apart_while_the_scene_goes_on() {
+    let poses = arc(18, 0.0, 90.0);
+    let mut sfm = disturbed(&poses);
+    let before = errors(&mut sfm, &poses);
+    // The last two come while the adjustment of the others is at work, where these have led them.
+    let late = sfm.scene.submaps[0].views.split_off(16);
+    let parted: Vec<_> = late
+        .iter()
+        .map(|view| sfm.scene.views[*view].registered)
+        .collect();
+    late.iter()
+        .for_each(|view| sfm.scene.views[*view].registered = None);
+    let work = GlobalAdjustment::of(&mut sfm.scene, 0, 2.0, 30).unwrap();
+    for (view, registered) in late.iter().zip(parted) {
+        sfm.scene.views[*view].registered = registered;
+        sfm.scene.submaps[0].views.push(*view);
+    }
+    let limits = sfm.newest_limits();
+    let (n_before, adjusted) = (sfm.scene.n_rebuilt, work.run());
+    assert!(adjusted.apply(&mut sfm.scene, &limits));
+    assert!(sfm.scene.n_rebuilt > n_before);
+    let after = errors(&mut sfm, &poses);
+    assert!(
+        before.0 > 0.2 && before.1 > 0.002,
+        "disturbed by {before:?}"
+    );
+    assert!(
+        after.0 < 0.7 * before.0 && after.1 < 0.85 * before.1,
+        "{before:?} -> {after:?}"
+    );
+    assert!(!adjusted.apply(&mut sfm.scene, &limits), "it counts once");
+}
+
+#[test]
+fn what_was_adjusted_apart_is_dropped_where_the_scene_was_rebuilt() {
+    let poses = arc(12, 0.0, 60.0);
+    let mut sfm = disturbed(&poses);
+    let work = GlobalAdjustment::of(&mut sfm.scene, 0, 2.0, 8).unwrap();
+    adjust_global(&mut sfm.scene, 0, 2.0, 8);
+    let limits = sfm.newest_limits();
+    let poses_there: Vec<_> = sfm
+        .scene
+        .views
+        .iter()
+        .map(|v| v.registered.map(|p| p.cam_from_world))
+        .collect();
+    assert!(!work.run().apply(&mut sfm.scene, &limits));
+    let same = sfm
+        .scene
+        .views
+        .iter()
+        .map(|v| v.registered.map(|p| p.cam_from_world));
+    assert!(same.eq(poses_there));
+}
+
 #[test]
 fn an_unknown_focal_length_is_found_with_the_poses() {
     let poses = arc(18, 0.0, 90.0);
