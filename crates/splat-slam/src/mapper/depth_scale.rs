@@ -23,9 +23,11 @@ const MIN_CHANGE: f32 = 0.002;
 /// Where the map shows less, it has no surface yet.
 const MIN_ALPHA: f32 = 0.8;
 
-/// Fits the depth of new views to the map, where the model's lengths are relative.
+/// Fits the depth of views to the map, where the model's lengths are relative: of `max_views` that were looked at too
+/// seldom so far, the oldest first, as each look takes a rendering.
 pub(crate) fn scale_depths(
     source: ScaleSource,
+    max_views: usize,
     keyframes: &mut KeyframeStore,
     engine: &mut dyn Engine,
 ) -> Result<(), EngineError> {
@@ -34,13 +36,10 @@ pub(crate) fn scale_depths(
     }
     let map_poses = engine.poses()?;
     let focal_factor = engine.focal_scale()?;
-    for registered in keyframes.values_mut() {
-        if registered.depth_fit.n_looks >= N_LOOKS
-            || registered.is_held_out
-            || !registered.home.is_here
-        {
-            continue;
-        }
+    let is_due = |p: &&mut RegisteredKeyframe| {
+        p.depth_fit.n_looks < N_LOOKS && !p.is_held_out && p.home.is_here
+    };
+    for registered in keyframes.values_mut().filter(is_due).take(max_views) {
         registered.depth_fit.n_looks += 1;
         let intrinsics = registered.intrinsics.refocused(focal_factor);
         let pose = &map_poses[registered.view_ix];

@@ -49,6 +49,8 @@ pub const MAX_WAITING: usize = 200;
 /// Steps between looks at a view for holes and errors, and between removals of transparent splats.
 const RESEED_EVERY: u64 = 50;
 const PRUNE_EVERY: u64 = 400;
+/// Steps between looks at the depth of one view, while more views are to come: they wait for nothing that takes long.
+const SCALE_ONE_EVERY: u64 = 3;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to converge.
 const LAST_RESEED: f32 = 0.6;
 
@@ -178,12 +180,17 @@ impl Mapper {
                 self.rotate()?;
                 self.splats.note_peaks(&*self.engine);
             }
-            if n_steps.is_multiple_of(ANCHOR_EVERY) {
-                if settings.pose != PoseMode::Held {
-                    self.hold_anchor()?;
-                }
+            if n_steps.is_multiple_of(ANCHOR_EVERY) && settings.pose != PoseMode::Held {
+                self.hold_anchor()?;
+            }
+            let looks = if end == End::Unknown {
+                (SCALE_ONE_EVERY, 1)
+            } else {
+                (ANCHOR_EVERY, usize::MAX)
+            };
+            if n_steps.is_multiple_of(looks.0) {
                 let source = self.scale.scale().source;
-                scale_depths(source, &mut self.keyframes, &mut *self.engine)?;
+                scale_depths(source, looks.1, &mut self.keyframes, &mut *self.engine)?;
             }
         }
         Ok(n)
