@@ -31,6 +31,9 @@ pub struct Report {
     pub timing_s: Timing,
     pub steps_per_s: Option<f64>,
     pub latency_ms: Latency,
+    /// Live; nothing in a replay.
+    #[serde(default)]
+    pub load_shed: LoadShedding,
     #[serde(default)]
     pub tracking: TrackingFigures,
     pub peak_rss_mib: Option<f64>,
@@ -108,6 +111,18 @@ pub struct Latency {
     pub frame_to_pose_p50: Option<f64>,
     #[serde(default)]
     pub frame_to_pose_p95: Option<f64>,
+}
+
+/// What was left out, or waited, since poses were more urgent.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct LoadShedding {
+    /// Keyframes that had gathered, so that each got fewer features and fewer matches.
+    pub hurried_keyframes: u64,
+    /// Keyframes that were not compared with places seen long before.
+    pub unsought_keyframes: u64,
+    /// Seconds that depth, and steps of the optimiser, waited for poses.
+    pub depth_s: f64,
+    pub steps_s: f64,
 }
 
 /// Poses of single frames.

@@ -1,5 +1,6 @@
 //! Batches -> geometry: the model as a stage, and the thread that it runs on live.
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -32,6 +33,8 @@ pub(crate) struct GeometryStage {
     /// The map goes on from a saved one, which is found again by depth.
     has_prior: bool,
     has_registered: bool,
+    /// Live: seconds that depth waited for poses.
+    waited_secs: f64,
 }
 
 /// What geometry leaves behind, even where it was given up at a batch.
@@ -48,6 +51,7 @@ impl GeometryStage {
             tally: Arc::default(),
             has_prior: !params.map.resume.is_empty(),
             has_registered: false,
+            waited_secs: 0.0,
         }
     }
 
@@ -120,10 +124,11 @@ impl GeometryStage {
     }
 
     /// Depth that another thread has worked out in so many seconds.
-    fn take_depth(&mut self, (swept, secs): (SweptDepth, f64)) -> Option<GeometryBatch> {
+    fn take_depth(&mut self, swept: Swept) -> Option<GeometryBatch> {
         let watch = Stopwatch::start();
-        let depth = self.model.take_depth(swept);
-        self.lock().secs += watch.secs() + secs;
+        let depth = self.model.take_depth(swept.found);
+        self.waited_secs += swept.waited_secs;
+        self.lock().secs += watch.secs() + swept.secs;
         depth
     }
 
@@ -250,9 +255,16 @@ impl<Job, Done> Worker<Job, Done> {
     }
 }
 
+/// Depth that was worked out, the seconds that it took, and those among them that it waited for poses.
+struct Swept {
+    found: SweptDepth,
+    secs: f64,
+    waited_secs: f64,
+}
+
 /// What goes on beside poses.
 struct Beside {
-    depth: Worker<SweepJob, (SweptDepth, f64)>,
+    depth: Worker<SweepJob, Swept>,
     adjustment: Worker<Work, f64>,
     /// Since when the last adjustment is done, and how many seconds it took.
     adjusted: Option<(Stopwatch, f64)>,
@@ -270,20 +282,24 @@ fn run_adjustment(work: &Receiver<Work>, adjusted: &Sender<f64>) {
 }
 
 /// Ends when no more jobs come. Depth waits while poses are at work: beside it, they would take half as long again on few cores.
-fn run_depth(
-    jobs: &Receiver<SweepJob>,
-    swept: &Sender<(SweptDepth, f64)>,
-    backpressure: &Backpressure,
-) {
+fn run_depth(jobs: &Receiver<SweepJob>, swept: &Sender<Swept>, backpressure: &Backpressure) {
     while let Some(job) = jobs.recv() {
         let watch = Stopwatch::start();
+        let waited = AtomicU64::new(0);
         let give_way = || {
+            let waiting = Stopwatch::start();
             while backpressure.is_at_work() && watch.secs() < MAX_DEPTH_SECS {
                 std::thread::sleep(POSE_TICK);
             }
+            waited.fetch_add((waiting.secs() * 1e6) as u64, Ordering::Relaxed);
         };
         let found = job.run_giving_way(&give_way);
-        if swept.send((found, watch.secs())).is_err() {
+        let done = Swept {
+            found,
+            secs: watch.secs(),
+            waited_secs: waited.into_inner() as f64 * 1e-6,
+        };
+        if swept.send(done).is_err() {
             return;
         }
     }
@@ -300,7 +316,7 @@ fn give_poses(
     let mut since_batch = Stopwatch::start();
     loop {
         let is_quiet = since_batch.secs() > QUIET_SECS;
-        let geometry = match next(&mut stage, &mut beside, batches, is_quiet) {
+        let mut geometry = match next(&mut stage, &mut beside, batches, is_quiet) {
             Next::Answer(geometry) => geometry,
             Next::Batch(batch) => {
                 let reported = stage.sooner(&batch);
@@ -316,6 +332,7 @@ fn give_poses(
             Next::Nothing => continue,
             Next::Ended => return last_answer(stage, answers),
         };
+        geometry.load_shed.depth_secs = stage.waited_secs;
         if answers.send((newest.clone(), geometry)).is_err() {
             return None;
         }

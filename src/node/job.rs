@@ -23,6 +23,7 @@ use splat_ros::output::Output;
 use splat_ros::publisher::Publisher;
 use splat_ros::transport::Transport;
 use splat_slam::mapper::mapper::Mapper;
+use splat_types::load_shed::LoadShed;
 use splat_types::snapshot::{KeyframePose, Scale, Snapshot};
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
@@ -93,6 +94,8 @@ pub struct StageSecs {
 /// Seconds from the selection of each keyframe.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct KeyframeLatency {
+    /// What gave way for it.
+    pub load_shed: LoadShed,
     pub to_pose_secs: Vec<f64>,
     /// To the first snapshot that has it.
     pub to_snapshot_secs: Vec<f64>,

@@ -22,6 +22,7 @@ use splat_slam::mapper::train::schedule::{self, End};
 use splat_slam::select::selector::{Batcher, Selector};
 use splat_slam::track::landmarks::KeyframeView;
 use splat_types::frame::{Batch, Frame};
+use splat_types::load_shed::LoadShed;
 use splat_types::snapshot::Snapshot;
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
@@ -92,6 +93,14 @@ pub(crate) struct MapFigures {
 }
 
 impl MapFigures {
+    /// Depth and places that were known when the last one came stay: the answer at the end counts nothing.
+    fn note_load_shed(&mut self, geometry: &LoadShed) {
+        let known = &mut self.latency.load_shed;
+        known.hurried_keyframes = known.hurried_keyframes.max(geometry.hurried_keyframes);
+        known.unsought_keyframes = known.unsought_keyframes.max(geometry.unsought_keyframes);
+        known.depth_secs = known.depth_secs.max(geometry.depth_secs);
+    }
+
     /// A snapshot shows its keyframes from now on.
     fn shown(&mut self, snapshot: &Snapshot) {
         for pose in &snapshot.poses {
@@ -196,6 +205,7 @@ impl MapStage {
             .zip(newest)
             .map(|(all, seen)| (seen as f64 / all.max(1) as f64).min(1.0));
         let figures = &mut self.figures;
+        figures.note_load_shed(&geometry.load_shed);
         for keyframe in batch.iter().flat_map(|b| &b.keyframes) {
             figures.n_keyframes = figures.n_keyframes.max(keyframe.id as usize + 1);
             if !self.map.has_keyframe(keyframe.id) {
@@ -219,6 +229,11 @@ impl MapStage {
             let due = schedule::due(&self.params, progress.unwrap_or(0.0));
             self.step_until(due, publish);
         }
+    }
+
+    /// Live: steps have waited for poses.
+    pub(crate) fn note_waited(&mut self, secs: f64) {
+        self.figures.latency.load_shed.steps_secs += secs;
     }
 
     /// Live: whether splats wait, since poses of keyframes are at work; now and then a step is made all the same.
@@ -377,7 +392,9 @@ impl MapStage {
 
     fn report_counts(&self) {
         let (map, optimise_secs) = (&self.map, self.figures.optimise_secs);
+        let load_shed = self.figures.latency.load_shed;
         self.report(|status| {
+            status.load_shed = load_shed;
             status.n_registered = map.n_keyframes() as u64;
             status.n_submaps = map.submaps().len() as u64;
             status.n_splats = map.n_splats() as u64;

@@ -382,8 +382,10 @@ fn run_map(
             match answers.try_recv() {
                 Ok(Some(answer)) => Ok(answer),
                 Ok(None) if stage.gives_way(poses) => {
+                    let waited = Stopwatch::start();
                     stage.snapshot_if_due(publish);
                     std::thread::sleep(POSE_TICK);
+                    stage.note_waited(waited.secs());
                     continue;
                 }
                 Ok(None) if stage.step_while_waiting(publish) => {

@@ -17,8 +17,8 @@ use crate::eval::frames::{self, FrameRow, Source as Known};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
 use crate::eval::report_json::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Resumed, Timing, TrackingFigures,
-    percentile,
+    FrameCounts, KeyframeCounts, Latency, LoadShedding, Quality, Report, Resumed, Timing,
+    TrackingFigures, percentile,
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::machine::memory::peak_rss_mib;
@@ -230,6 +230,15 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             &outcome.latency.to_snapshot_secs,
             &outcome.tracking.latency_secs,
         ),
+        load_shed: {
+            let known = &outcome.latency.load_shed;
+            LoadShedding {
+                hurried_keyframes: known.hurried_keyframes,
+                unsought_keyframes: known.unsought_keyframes,
+                depth_s: known.depth_secs,
+                steps_s: known.steps_secs,
+            }
+        },
         tracking: TrackingFigures::default(),
         peak_rss_mib: peak_rss_mib(),
         peak_gpu_mib: match outcome.map.peak_gpu_bytes() {

@@ -254,6 +254,21 @@ fn figures(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
         ("keyframes registered", count(report.keyframes.registered)),
         ("components", count(report.keyframes.submaps)),
         (
+            "keyframes hurried",
+            count(report.load_shed.hurried_keyframes),
+        ),
+        (
+            "keyframes not compared with places of long ago",
+            count(report.load_shed.unsought_keyframes),
+        ),
+        (
+            "depth and steps waited for poses",
+            format!(
+                "{:.1} s, {:.1} s",
+                report.load_shed.depth_s, report.load_shed.steps_s
+            ),
+        ),
+        (
             "PSNR of training views",
             format!("{} dB", decibels(quality.psnr_train)),
         ),

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use splat_mapper::eval::report_json::{
-    FrameCounts, KeyframeCounts, Latency, Quality, Report, Resumed, Timing, TrackingFigures,
+    FrameCounts, KeyframeCounts, Latency, LoadShedding, Quality, Report, Resumed, Timing,
+    TrackingFigures,
 };
 use splat_mapper::params::settings::Settings;
 use splat_slam::mapper::budgets::Budgets;
@@ -47,6 +48,10 @@ latency_ms.keyframe_to_pose_p50
 latency_ms.keyframe_to_pose_p95
 latency_ms.keyframe_to_snapshot_p50
 latency_ms.keyframe_to_snapshot_p95
+load_shed.depth_s
+load_shed.hurried_keyframes
+load_shed.steps_s
+load_shed.unsought_keyframes
 map_sha256
 parameters.train.steps
 peak_gpu_mib
@@ -103,6 +108,12 @@ pub(crate) fn sample_report() -> Report {
         adapter: "cpu (2 threads, avx2)".to_owned(),
         seed: 7,
         map_sha256: "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad".to_owned(),
+        load_shed: LoadShedding {
+            hurried_keyframes: 9,
+            unsought_keyframes: 2,
+            depth_s: 3.25,
+            steps_s: 12.5,
+        },
         timing_s: Timing {
             wall: 148.2,
             decode: 1.9,

@@ -3,6 +3,7 @@
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
+use splat_types::load_shed::LoadShed;
 use splat_types::transform::Rigid;
 
 /// How far a view can be trusted.
@@ -112,6 +113,8 @@ pub struct GeometryBatch {
     pub is_loop: bool,
     /// Why keyframes are missing, one plain sentence, for status and errors.
     pub note: Option<String>,
+    /// Live, since the start.
+    pub load_shed: LoadShed,
 }
 
 impl GeometryBatch {

@@ -7,6 +7,7 @@ use splat_io::frame_source::SourceCounts;
 use splat_msgs::ros::Header;
 use splat_msgs::ros::standard::{DiagnosticArray, DiagnosticStatus, KeyValue};
 use splat_msgs::status_message::MapperStatus;
+use splat_types::load_shed::LoadShed;
 use splat_types::snapshot::Scale;
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::tracking::TrackState;
@@ -106,6 +107,8 @@ pub struct MapStatus {
     pub steps_per_s: f64,
     pub gpu_bytes: u64,
     pub keyframe_to_pose: Times,
+    /// What was left out, or waited, since poses were more urgent.
+    pub load_shed: LoadShed,
     /// Why the map is being put on another engine.
     pub recovering: Option<String>,
 }
@@ -172,6 +175,7 @@ impl Status<'_> {
             let n = self.map.n_submaps;
             warnings.push(format!("{n} parts of the input do not hang together"));
         }
+        warnings.extend(short_of_time(&self.map.load_shed));
         warnings
     }
 
@@ -214,6 +218,18 @@ impl Status<'_> {
             warnings: self.warnings(silent_secs),
         }
     }
+}
+
+/// `None` where nothing was left out. That steps and depth wait is no fault: they get what poses leave.
+fn short_of_time(load_shed: &LoadShed) -> Option<String> {
+    let (hurried, unsought) = (load_shed.hurried_keyframes, load_shed.unsought_keyframes);
+    (hurried + unsought > 0).then(|| {
+        format!(
+            "short of time: {hurried} keyframes got fewer features, {unsought} were not compared with places of long ago; \
+             depth has waited {:.0} s, steps {:.0} s",
+            load_shed.depth_secs, load_shed.steps_secs
+        )
+    })
 }
 
 /// The status as `/diagnostics` has it: input, tracking, map.
@@ -352,6 +368,26 @@ mod tests {
                 .warnings
                 .iter()
                 .any(|w| w.contains("no image has come for 5 s"))
+        );
+    }
+
+    #[test]
+    fn what_was_left_out_for_lack_of_time_is_a_warning_and_waiting_alone_is_none() {
+        let mut shed = LoadShed {
+            depth_secs: 3.0,
+            steps_secs: 40.0,
+            ..LoadShed::default()
+        };
+        assert_eq!(short_of_time(&shed), None);
+        shed.hurried_keyframes = 5;
+        let warning = short_of_time(&shed).unwrap();
+        assert!(
+            warning.contains("5 keyframes got fewer features"),
+            "{warning}"
+        );
+        assert!(
+            warning.contains("depth has waited 3 s, steps 40 s"),
+            "{warning}"
         );
     }
 

@@ -24,6 +24,8 @@ pub mod rendering;
 
 pub mod tracking;
 
+pub mod load_shed;
+
 pub mod splats;
 
 pub mod snapshot;

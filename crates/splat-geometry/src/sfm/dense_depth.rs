@@ -216,6 +216,7 @@ fn reported(sparse: &SparseBatch, views: Vec<View>) -> GeometryBatch {
         is_loop: sparse.is_loop,
         observations: sparse.views.iter().map(observations).collect(),
         note: sparse.note.clone(),
+        ..GeometryBatch::default()
     }
 }
 

@@ -28,6 +28,7 @@ use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
 use crate::sfm::updates::{Reported, SparseBatch, note};
 use splat_types::camera::Intrinsics;
 use splat_types::frame::{Batch, Keyframe};
+use splat_types::load_shed::LoadShed;
 
 /// Size of the image that `sfm.max_error_px` is meant for.
 const ERROR_SIDE_PX: f64 = 640.0;
@@ -63,12 +64,19 @@ pub struct Sfm {
     last_start: Option<Start>,
     /// A loop was closed since the last report.
     is_loop: bool,
-    /// Live: views that are not yet compared with those long before them.
-    behind: Vec<usize>,
+    live: LiveState,
+}
+
+/// What only a live run has.
+#[derive(Debug, Default)]
+struct LiveState {
     /// Poses come by `sparse_soon`, until the end: submaps are adjusted as a whole by `GlobalAdjustment`.
-    is_live: bool,
-    /// What the newest of those has found.
+    is_on: bool,
+    /// Views that are not yet compared with those long before them.
+    behind: Vec<usize>,
+    /// What the newest adjustment has found.
     adjusted: Arc<Mutex<Option<AdjustedSubmap>>>,
+    load_shed: LoadShed,
 }
 
 /// What is done for each new keyframe.
@@ -92,9 +100,7 @@ impl Sfm {
             batch_id: 0,
             last_start: None,
             is_loop: false,
-            behind: Vec::new(),
-            is_live: false,
-            adjusted: Arc::default(),
+            live: LiveState::default(),
         })
     }
 
@@ -111,10 +117,11 @@ impl Sfm {
     /// to register the new keyframes.
     fn sparse_soon(&mut self, batch: &Batch) -> SparseBatch {
         self.batch_id = batch.id;
-        self.is_live = true;
+        self.live.is_on = true;
         let first_new = self.scene.views.len();
         let n_new = batch.keyframes.len().saturating_sub(batch.n_shared);
         let effort = if n_new >= MANY_NEW {
+            self.live.load_shed.hurried_keyframes += n_new as u64;
             Effort {
                 max_features: (self.sfm.max_features as f64 * FEATURES_OF_MANY) as usize,
                 n_last: N_LAST_OF_MANY,
@@ -129,19 +136,20 @@ impl Sfm {
             link_last(scene, newest, effort.n_last, max_error_px, seed);
         };
         let limits = self.take_in_with(&batch.keyframes, effort.max_features, link);
-        self.behind.extend(first_new..self.scene.views.len());
+        self.live.behind.extend(first_new..self.scene.views.len());
         let fresh: Vec<usize> = (first_new..self.scene.views.len()).collect();
         grow_at_once(&mut self.scene, &fresh, &limits);
         let is_missing = |ix: &usize| self.scene.views[*ix].registered.is_none();
         let missing: Vec<usize> = fresh.into_iter().filter(is_missing).collect();
         if !missing.is_empty() {
-            self.behind.retain(|ix| !missing.contains(ix));
+            self.live.behind.retain(|ix| !missing.contains(ix));
             self.link_older(&missing, &limits);
             self.place_newest(&limits);
         }
         // Their neighbours stand for those that no time was left for.
-        let n_left_out = self.behind.len().saturating_sub(MAX_BEHIND);
-        self.behind.drain(..n_left_out);
+        let n_left_out = self.live.behind.len().saturating_sub(MAX_BEHIND);
+        self.live.load_shed.unsought_keyframes += n_left_out as u64;
+        self.live.behind.drain(..n_left_out);
         let shared = self.shared_views(batch);
         self.report(&shared)
     }
@@ -149,11 +157,11 @@ impl Sfm {
     /// Some of what `sparse_soon` has left, in slices, since new keyframes wait meanwhile: what one view has seen long ago.
     /// `None`: nothing is left.
     fn refined(&mut self) -> Option<SparseBatch> {
-        if self.behind.is_empty() {
+        if self.live.behind.is_empty() {
             return None;
         }
         let limits = self.newest_limits();
-        let next = self.behind.remove(0);
+        let next = self.live.behind.remove(0);
         self.link_older(&[next], &limits);
         self.place_newest(&limits);
         Some(self.report(&[]))
@@ -167,7 +175,7 @@ impl Sfm {
     }
 
     fn take_adjusted(&mut self) -> Option<SparseBatch> {
-        let adjusted = self.adjusted.lock();
+        let adjusted = self.live.adjusted.lock();
         let adjusted = adjusted.unwrap_or_else(PoisonError::into_inner).take()?;
         let limits = self.newest_limits();
         let is_applied = adjusted.apply(&mut self.scene, &limits);
@@ -201,7 +209,7 @@ impl Sfm {
 
     /// Last chance for what waits, then all is adjusted together.
     pub fn finish_sparse(&mut self) -> SparseBatch {
-        self.is_live = false;
+        self.live.is_on = false;
         let keyframes: Vec<Arc<Keyframe>> = self
             .scene
             .views
@@ -209,7 +217,7 @@ impl Sfm {
             .map(|s| Arc::clone(&s.keyframe))
             .collect();
         let limits = self.limits(&keyframes);
-        let behind = std::mem::take(&mut self.behind);
+        let behind = std::mem::take(&mut self.live.behind);
         self.link_older(&behind, &limits);
         let waiting = self.waiting();
         for &view in &waiting {
@@ -309,7 +317,7 @@ impl Sfm {
             min_inliers: self.sfm.min_inliers,
             min_parallax_deg: self.sfm.min_parallax_deg,
             local_ba_prior: self.sfm.local_ba_prior,
-            is_global_deferred: self.is_live,
+            is_global_deferred: self.live.is_on,
             seed: self.seed,
         }
     }
@@ -448,10 +456,19 @@ impl Sfm {
 }
 
 impl Sfm {
+    fn with_poses(&mut self, sparse: SparseBatch) -> GeometryBatch {
+        let scene = &self.scene;
+        GeometryBatch {
+            load_shed: self.live.load_shed,
+            ..self.densifier.poses(sparse, &|id| scene.image_of(id))
+        }
+    }
+
     fn with_depth(&self, view: View) -> GeometryBatch {
         GeometryBatch {
             batch_id: self.batch_id,
             views: vec![view],
+            load_shed: self.live.load_shed,
             ..GeometryBatch::default()
         }
     }
@@ -469,19 +486,17 @@ impl GeometryModel for Sfm {
 
     fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
         let sparse = self.sparse_soon(batch);
-        let scene = &self.scene;
-        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+        Some(self.with_poses(sparse))
     }
 
     fn refine(&mut self) -> Option<GeometryBatch> {
         let sparse = self.refined()?;
-        let scene = &self.scene;
-        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+        Some(self.with_poses(sparse))
     }
 
     fn adjustment(&mut self) -> Option<Work> {
         let work = self.next_adjustment()?;
-        let found = Arc::clone(&self.adjusted);
+        let found = Arc::clone(&self.live.adjusted);
         Some(Box::new(move || {
             let adjusted = work.run();
             *found.lock().unwrap_or_else(PoisonError::into_inner) = Some(adjusted);
@@ -490,8 +505,7 @@ impl GeometryModel for Sfm {
 
     fn take_adjustment(&mut self) -> Option<GeometryBatch> {
         let sparse = self.take_adjusted()?;
-        let scene = &self.scene;
-        Some(self.densifier.poses(sparse, &|id| scene.image_of(id)))
+        Some(self.with_poses(sparse))
     }
 
     fn depth(&mut self) -> Option<DepthTask> {
