@@ -209,14 +209,21 @@ fn run_live(
     let (swept_tx, swept) = queue("depth", 1, WhenFull::Wait);
     let (work_tx, work) = queue("adjustments", 1, WhenFull::Wait);
     let (adjusted_tx, adjusted) = queue("adjusted", 1, WhenFull::Wait);
+    // Not joined: one of a large map takes seconds, and at the end of a run nothing waits for it.
+    let adjust = move || {
+        let work = || run_adjustment(&work, &adjusted_tx);
+        in_own_pool("adjust", Niceness::Adjustment, work);
+    };
+    if let Err(e) = std::thread::Builder::new()
+        .name("adjust".to_owned())
+        .spawn(adjust)
+    {
+        tracing::warn!("keyframes are not adjusted together before the end: no thread for it: {e}");
+    }
     std::thread::scope(|scope| {
         scope.spawn(move || {
             let work = || run_depth(&jobs, &swept_tx, backpressure);
             in_own_pool("depth", Niceness::Depth, work);
-        });
-        scope.spawn(move || {
-            let work = || run_adjustment(&work, &adjusted_tx);
-            in_own_pool("adjust", Niceness::Adjustment, work);
         });
         let beside = Beside {
             depth: Worker::new(jobs_tx, swept),
