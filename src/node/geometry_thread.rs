@@ -88,18 +88,12 @@ impl GeometryStage {
 
     /// Better poses of keyframes that came earlier.
     fn refine(&mut self) -> Option<GeometryBatch> {
-        let watch = Stopwatch::start();
-        let refined = self.model.refine();
-        self.lock().secs += watch.secs();
-        refined
+        self.timed(|model| model.refine())
     }
 
     /// The adjustment of all keyframes as work for another thread.
     fn adjustment(&mut self) -> Option<Work> {
-        let watch = Stopwatch::start();
-        let work = self.model.adjustment();
-        self.lock().secs += watch.secs();
-        work
+        self.timed(|model| model.adjustment())
     }
 
     /// What that work has found in so many seconds.
@@ -117,19 +111,22 @@ impl GeometryStage {
 
     /// Depth of one more keyframe, or the work that it takes.
     fn depth(&mut self) -> Option<DepthTask> {
-        let watch = Stopwatch::start();
-        let depth = self.model.depth();
-        self.lock().secs += watch.secs();
-        depth
+        self.timed(|model| model.depth())
     }
 
     /// Depth that another thread has worked out in so many seconds.
     fn take_depth(&mut self, swept: Swept) -> Option<GeometryBatch> {
-        let watch = Stopwatch::start();
-        let depth = self.model.take_depth(swept.found);
         self.waited_secs += swept.waited_secs;
-        self.lock().secs += watch.secs() + swept.secs;
-        depth
+        self.lock().secs += swept.secs;
+        self.timed(|model| model.take_depth(swept.found))
+    }
+
+    /// What the model says, whose time counts as geometry's.
+    fn timed<T>(&mut self, ask: impl FnOnce(&mut dyn GeometryModel) -> T) -> T {
+        let watch = Stopwatch::start();
+        let said = ask(&mut *self.model);
+        self.lock().secs += watch.secs();
+        said
     }
 
     fn lock(&self) -> MutexGuard<'_, GeometryTally> {

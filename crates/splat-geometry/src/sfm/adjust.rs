@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
 use crate::optim::bundle::adjust;
 use crate::optim::bundle::problem::{Camera, Observation, Problem, Settings};
@@ -84,25 +84,27 @@ pub(crate) fn adjust_global(
     let Some(&first) = views.first() else { return };
     let before = spread(scene, first, &views);
     run(scene, &of_all(&views, max_steps), max_error_px);
-    // With one camera held the scale is free; it would drift from one adjustment to the next.
     if let Some(centre) = scene.centre(first) {
-        let mut ratios: Vec<f64> = spread(scene, first, &views)
-            .iter()
-            .zip(&before)
-            .map(|(a, b)| b / a)
-            .collect();
-        ratios.retain(|r| r.is_finite() && *r > 0.0);
-        if let Some(scale) = median(&mut ratios) {
-            let new_from_old = Similarity {
-                scale,
-                translation: centre * (1.0 - scale),
-                ..Similarity::IDENTITY
-            };
+        let after = spread(scene, first, &views);
+        if let Some(new_from_old) = kept_scale(centre, &before, &after) {
             scene.transform(submap, &new_from_old);
         }
     }
     scene.submaps[submap as usize].n_adjusted = views.len();
     scene.n_rebuilt += 1;
+}
+
+/// With one camera held the scale is free; it would drift from one adjustment to the next. What puts it back, about that
+/// camera, by the distances of the others to it before and after. `None` where there are none.
+pub(crate) fn kept_scale(centre: DVec3, before: &[f64], after: &[f64]) -> Option<Similarity> {
+    let pairs = after.iter().zip(before);
+    let mut ratios: Vec<f64> = pairs.map(|(a, b)| b / a).collect();
+    ratios.retain(|r| r.is_finite() && *r > 0.0);
+    median(&mut ratios).map(|scale| Similarity {
+        scale,
+        translation: centre * (1.0 - scale),
+        ..Similarity::IDENTITY
+    })
 }
 
 /// All views of a submap but the first, which holds the frame.

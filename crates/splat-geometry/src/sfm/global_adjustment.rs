@@ -8,11 +8,10 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use crate::sfm::adjust::{AdjustTask, adjust_local, share_lens};
+use crate::sfm::adjust::{AdjustTask, adjust_local, kept_scale, share_lens};
 use crate::sfm::landmarks::filter;
 use crate::sfm::limits::Limits;
 use crate::sfm::reconstruction::Reconstruction;
-use crate::stats::median;
 use splat_types::transform::{Rigid, Similarity};
 
 /// The work, which needs nothing of the scene.
@@ -73,7 +72,7 @@ impl GlobalAdjustment {
         let lens = old_lens
             .zip(new_lens)
             .map(|((old_fx, _), (fx, radial))| (fx / old_fx, radial));
-        let kept = self.kept_scale(&start);
+        let kept = self.scale_back(&start);
         let task = self.task;
         let moved = poses(&task).map(|pose| kept.transform_pose(&pose.inverse()).inverse());
         let both = start.into_iter().zip(moved).map(|(old, new)| [old, new]);
@@ -89,22 +88,17 @@ impl GlobalAdjustment {
         }
     }
 
-    /// With one camera held the scale is free; it would drift from one adjustment to the next. About the camera that is held.
-    fn kept_scale(&self, start: &[Rigid]) -> Similarity {
+    /// What puts the scale back to what it was.
+    fn scale_back(&self, start: &[Rigid]) -> Similarity {
         let held = self.task.views.iter().position(|view| *view == self.first);
-        let Some(centre) = held.map(|ix| start[ix].inverse().translation) else {
-            return Similarity::IDENTITY;
-        };
-        let away = |pose: &Rigid| pose.inverse().translation.distance(centre);
-        let pairs = start.iter().zip(poses(&self.task));
-        let mut ratios: Vec<f64> = pairs.map(|(old, new)| away(old) / away(&new)).collect();
-        ratios.retain(|r| r.is_finite() && *r > 0.0);
-        let scale = median(&mut ratios).unwrap_or(1.0);
-        Similarity {
-            scale,
-            translation: centre * (1.0 - scale),
-            ..Similarity::IDENTITY
-        }
+        let kept = held.and_then(|ix| {
+            let centre = start[ix].inverse().translation;
+            let away = |pose: &Rigid| pose.inverse().translation.distance(centre);
+            let before: Vec<f64> = start.iter().map(away).collect();
+            let after: Vec<f64> = poses(&self.task).map(|pose| away(&pose)).collect();
+            kept_scale(centre, &before, &after)
+        });
+        kept.unwrap_or(Similarity::IDENTITY)
     }
 }
 
