@@ -1,6 +1,6 @@
 //! Registered keyframes with landmarks -> views with depth: chooses ranges and neighbours for the stereo.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::answer::{GeometryBatch, Observations, PoseStd, PoseUpdate, SeenLandmark, View};
@@ -8,6 +8,7 @@ use crate::mvs::depth_stream::{DepthStream, SweepJob, SweptDepth};
 use crate::mvs::neighbours::depth_range;
 use crate::mvs::params::MvsParams;
 use crate::mvs::view::MvsView;
+use crate::sfm::depth_schedule::{DepthSchedule, Due};
 use crate::sfm::updates::{SparseBatch, SparseView};
 use splat_gpu::error::GpuError;
 use splat_image::undistort::Undistorter;
@@ -17,8 +18,6 @@ use splat_types::image::RgbImage;
 
 /// Images and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 32;
-/// Views that wait for a better depth, the newest.
-const MAX_AGAIN: usize = 4;
 /// Poses that moved its pixels by more since the sweep make a depth map out of date.
 const MAX_DRIFT_PX: f64 = 1.0;
 
@@ -29,9 +28,8 @@ pub(crate) struct Densifier {
     state: DepthStream,
     /// Of all views so far: the lens by which the image was undistorted.
     lenses: BTreeMap<u32, Option<CameraModel>>,
-    /// Views whose poses were reported: those without depth, and those whose depth may be better by now.
-    waiting: VecDeque<SparseView>,
-    again: VecDeque<SparseView>,
+    /// Live: views whose poses were reported before their depth.
+    schedule: DepthSchedule,
     /// The view whose sweep is on its way.
     at_work: Option<SparseView>,
 }
@@ -50,8 +48,7 @@ impl Densifier {
             params: params.clone(),
             state: DepthStream::new(params.clone(), MAX_HELD)?,
             lenses: BTreeMap::new(),
-            waiting: VecDeque::new(),
-            again: VecDeque::new(),
+            schedule: DepthSchedule::new(MAX_HELD),
             at_work: None,
         })
     }
@@ -78,47 +75,53 @@ impl Densifier {
     ) -> GeometryBatch {
         self.take_in(&sparse, image_of);
         for revision in &sparse.revised {
-            let waiting = self.waiting.iter_mut().chain(&mut self.again);
-            let waiting = waiting.chain(&mut self.at_work);
-            for view in waiting.filter(|view| view.keyframe_id == revision.keyframe_id) {
+            let at_work = self.at_work.iter_mut();
+            for view in at_work.filter(|view| view.keyframe_id == revision.keyframe_id) {
                 move_to(view, revision);
             }
         }
+        for view in &sparse.views {
+            self.schedule.note_reported(view.keyframe_id);
+        }
         let without_depth = |view| registered(view, DepthMap::none());
-        let reported = reported(&sparse, sparse.views.iter().map(without_depth).collect());
-        for view in sparse.views {
-            let is_other = |other: &SparseView| other.keyframe_id != view.keyframe_id;
-            self.waiting.retain(is_other);
-            self.again.retain(is_other);
-            if self.state.n_sources(view.keyframe_id) == 0 {
-                self.waiting.push_back(view);
-            } else {
-                self.again.push_back(view);
-            }
-        }
-        while self.again.len() > MAX_AGAIN {
-            self.again.pop_front();
-        }
-        while self.waiting.len() > MAX_HELD {
-            self.waiting.pop_front();
-        }
-        reported
+        reported(&sparse, sparse.views.iter().map(without_depth).collect())
     }
 
-    /// Depth of one more view of those whose poses were reported: of the newest, since frames are tracked by it. `None`: none
-    /// waits, or the sweep of another is on its way.
-    pub(crate) fn next(&mut self) -> Option<NextDepth> {
+    /// Depth of one more view of those whose poses were reported. `view_of` gives a view as it is known by now. `None`: there is
+    /// nothing to do, or the sweep of another is on its way.
+    pub(crate) fn next(
+        &mut self,
+        view_of: &dyn Fn(u32) -> Option<SparseView>,
+    ) -> Option<NextDepth> {
         if self.at_work.is_some() {
             return None;
         }
-        let view = self.waiting.pop_back().or_else(|| self.again.pop_front())?;
-        Some(match self.sweep_of(&view) {
-            Some(job) => {
-                self.at_work = Some(view);
-                NextDepth::Sweep(Box::new(job))
+        while let Some(due) = self.schedule.next() {
+            let (id, is_forced) = match due {
+                Due::Match(id) => (id, true),
+                Due::Verify(id) => (id, false),
+            };
+            match due {
+                Due::Match(id) => self.schedule.note_matched(id),
+                Due::Verify(id) => self.schedule.note_verified(id),
             }
-            None => NextDepth::Known(Box::new(self.view(&view))),
-        })
+            let Some(view) = view_of(id).filter(|_| self.state.holds(id)) else {
+                continue;
+            };
+            return Some(match self.sweep_of(&view, is_forced) {
+                Some(job) => {
+                    self.at_work = Some(view);
+                    NextDepth::Sweep(Box::new(job))
+                }
+                None => NextDepth::Known(Box::new(self.view(&view))),
+            });
+        }
+        None
+    }
+
+    /// Keyframes whose poses were reported and whose depth was never looked for.
+    pub(crate) fn unmatched(&self) -> Vec<u32> {
+        self.schedule.unmatched().collect()
     }
 
     /// A sweep has come back.
@@ -171,13 +174,13 @@ impl Densifier {
     }
 
     fn sweep(&mut self, view: &SparseView) {
-        if let Some(job) = self.sweep_of(view) {
+        if let Some(job) = self.sweep_of(view, false) {
             self.state.take(job.run());
         }
     }
 
-    /// For a new view, and for one swept before when it had too few sources or its camera has moved.
-    fn sweep_of(&mut self, view: &SparseView) -> Option<SweepJob> {
+    /// For a new view, for one swept before when it had too few sources or its camera has moved, and where it `is_forced`.
+    fn sweep_of(&mut self, view: &SparseView, is_forced: bool) -> Option<SweepJob> {
         let id = view.keyframe_id;
         let neighbours: Vec<u32> = view
             .neighbours
@@ -186,7 +189,8 @@ impl Densifier {
             .filter(|n| self.state.holds(*n))
             .collect();
         let n_sources = neighbours.len().min(self.params.source_views);
-        let is_current = self.state.n_sources(id) >= n_sources
+        let is_current = !is_forced
+            && self.state.n_sources(id) >= n_sources
             && self
                 .state
                 .drift_px(id)

@@ -25,7 +25,7 @@ use crate::sfm::params::SfmParams;
 use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView, Submap};
 use crate::sfm::register::{grow, grow_at_once};
 use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
-use crate::sfm::updates::{Reported, SparseBatch, note};
+use crate::sfm::updates::{self, Reported, SparseBatch, note};
 use splat_types::camera::Intrinsics;
 use splat_types::frame::{Batch, Keyframe};
 use splat_types::load_shed::LoadShed;
@@ -228,7 +228,12 @@ impl Sfm {
         for submap in 0..self.scene.submaps.len() as u32 {
             adjust_global(&mut self.scene, submap, limits.max_error_px, 30);
         }
-        self.report(&[])
+        let unmatched = self.densifier.unmatched();
+        let again: Vec<usize> = unmatched
+            .iter()
+            .filter_map(|id| self.view_of(*id))
+            .collect();
+        self.report(&again)
     }
 
     fn report(&mut self, again: &[usize]) -> SparseBatch {
@@ -509,7 +514,12 @@ impl GeometryModel for Sfm {
     }
 
     fn depth(&mut self) -> Option<DepthTask> {
-        Some(match self.densifier.next()? {
+        let scene = &self.scene;
+        let view_of = |id| {
+            let view_ix = scene.views.iter().rposition(|v| v.keyframe.id == id)?;
+            updates::view(scene, view_ix)
+        };
+        Some(match self.densifier.next(&view_of)? {
             NextDepth::Known(view) => DepthTask::Known(self.with_depth(*view)),
             NextDepth::Sweep(job) => DepthTask::Sweep(job),
         })

@@ -28,6 +28,8 @@ mod calibrate;
 
 pub mod updates;
 
+mod depth_schedule;
+
 mod dense_depth;
 
 mod undistorted_views;

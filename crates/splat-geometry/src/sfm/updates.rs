@@ -199,7 +199,8 @@ pub(crate) fn note(scene: &Reconstruction, start: Option<Start>) -> Option<Strin
     ))
 }
 
-fn view(scene: &Reconstruction, view_ix: usize) -> Option<SparseView> {
+/// A registered view as the scene knows it by now.
+pub(crate) fn view(scene: &Reconstruction, view_ix: usize) -> Option<SparseView> {
     let view = &scene.views[view_ix];
     let registered = view.registered.as_ref()?;
     let intrinsics = scene.intrinsics_of(view.keyframe.id)?;
