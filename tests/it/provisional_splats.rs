@@ -101,7 +101,7 @@ fn splats_from_landmarks_come_at_once_and_go_when_depth_comes() {
             .all(|id| !coarse.splat_ids.contains(id)),
         "no coarse splat is left"
     );
-    assert!(whole.splats.len() > 2 * coarse.splats.len());
+    assert!(whole.splats.len() > 1000, "{}", whole.splats.len());
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! Depth maps with a confidence for each pixel.
 
+use glam::DVec2;
+
 /// z-depth along the camera axis, in the length unit of whoever made it; 0 = no value.
 /// `confidence` is 0 (unverified: never use) to 1, one per pixel; only its order means anything between models.
 #[derive(Clone, PartialEq)]
@@ -49,6 +51,13 @@ impl DepthMap {
             depth: picked(&self.depth),
             confidence: picked(&self.confidence),
         }
+    }
+
+    /// The pixel that holds a place, in pixels of this map; `None` outside of it.
+    pub fn pixel_at(&self, place: DVec2) -> Option<usize> {
+        let (width, height) = (f64::from(self.width_px), f64::from(self.height_px));
+        let is_inside = place.x >= 0.0 && place.y >= 0.0 && place.x < width && place.y < height;
+        is_inside.then(|| place.y as usize * self.width_px as usize + place.x as usize)
     }
 
     /// Depth and confidence of pixel `at`; `None` where no depth was verified.

@@ -409,12 +409,12 @@ impl Mapper {
             self.trainer.reset_convergence();
         }
         let has_depth = |id: &&u32| self.keyframes.registered()[*id].depth.width_px > 0;
-        let fresh = fresh.iter().filter(has_depth);
-        let ids: Vec<u32> = fresh.chain(deepened).copied().collect();
-        self.balance(ids.len() * self.params.train.seeds_per_keyframe)?;
+        let fresh: Vec<u32> = fresh.iter().filter(has_depth).copied().collect();
+        let n = fresh.len() + deepened.len();
+        self.balance(n * self.params.train.seeds_per_keyframe)?;
         let (mut parts, trainer) = self.split();
-        parts.splats.take_provisional(deepened, parts.engine)?;
-        trainer.seed_each(&mut parts, &ids)?;
+        trainer.seed_each(&mut parts, &fresh, false)?;
+        trainer.seed_each(&mut parts, deepened, true)?;
         self.report_renumbered();
         Ok(())
     }

@@ -34,11 +34,6 @@ impl SplatIds {
         self.next = self.next.max(behind);
     }
 
-    /// What the next new splat gets.
-    pub(crate) fn next(&self) -> u32 {
-        self.next
-    }
-
     pub(crate) fn all(&self) -> &[u32] {
         &self.ids
     }

@@ -8,4 +8,6 @@ pub(crate) mod region_codec;
 
 pub mod regions;
 
+pub mod seeds;
+
 pub(crate) mod store;

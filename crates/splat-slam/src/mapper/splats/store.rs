@@ -4,7 +4,6 @@
 //! near them again. Views that look at a region on disk are not trained on: they would fill the hole.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::ops::Range;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -16,6 +15,7 @@ use crate::mapper::params::MapperParams;
 use crate::mapper::splats::ids::SplatIds;
 use crate::mapper::splats::region_codec::region_bytes;
 use crate::mapper::splats::regions::Evicted;
+use crate::mapper::splats::seeds::Seeds;
 use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
 use splat_types::camera::Intrinsics;
@@ -33,9 +33,6 @@ const MOST_WANTED: usize = 4;
 const N_SAMPLES: usize = 12;
 const MIN_SEEN: usize = 3;
 const SEEN_WITHIN: f64 = 6.0;
-
-/// Keyframes that splats stand in for at once; depth of more is not to be expected.
-const MAX_PROVISIONAL: usize = 64;
 
 /// Share of the cap that is open when the first frames come; all of it is at the end of the input.
 const FIRST_ROOM: f64 = 0.25;
@@ -82,8 +79,8 @@ pub(crate) struct SplatSet {
     n_resumed: usize,
     /// All ids are new, and no client knows them.
     is_renumbered: bool,
-    /// By keyframe, ids of splats that stand in until its depth comes.
-    provisional: BTreeMap<u32, Range<u32>>,
+    /// Ids of splats at a depth that no view has verified; some may be gone.
+    guessed: BTreeSet<u32>,
 }
 
 impl SplatSet {
@@ -133,36 +130,40 @@ impl SplatSet {
         Ok(())
     }
 
-    /// Adds splats of a keyframe that has no depth yet; `take_provisional` takes them away. Those of keyframes that have
-    /// waited for theirs the longest stay for good when there are too many.
-    pub(crate) fn append_provisional(
+    /// Adds splats, of which some lie at a depth that no view has verified.
+    pub(crate) fn append_seeds(
         &mut self,
-        keyframe_id: u32,
-        splats: &Splats,
+        seeds: &Seeds,
         engine: &mut dyn Engine,
     ) -> Result<(), EngineError> {
-        let first = self.ids.next();
-        self.append(splats, engine)?;
-        self.provisional.insert(keyframe_id, first..self.ids.next());
-        while self.provisional.len() > MAX_PROVISIONAL {
-            self.provisional.pop_first();
+        if seeds.splats.is_empty() {
+            return Ok(());
+        }
+        let n_before = engine.len();
+        self.append(&seeds.splats, engine)?;
+        let added = self.ids.all()[n_before..].iter().zip(&seeds.is_guess);
+        self.guessed
+            .extend(added.filter(|(_, is_guess)| **is_guess).map(|(id, _)| *id));
+        // What was pruned or went to disk must not add up.
+        if self.guessed.len() > 2 * engine.len() {
+            let here: BTreeSet<u32> = self.ids.all().iter().copied().collect();
+            self.guessed.retain(|id| here.contains(id));
         }
         Ok(())
     }
 
-    /// Takes away what stood in for the depth of keyframes.
-    pub(crate) fn take_provisional(
+    /// Takes away guesses that verified depth has something better for.
+    pub(crate) fn take_guesses(
         &mut self,
-        keyframe_ids: &[u32],
+        is_replaced: impl Fn(&Splats, usize) -> bool,
         engine: &mut dyn Engine,
     ) -> Result<(), EngineError> {
-        let ids = keyframe_ids.iter();
-        let gone: Vec<Range<u32>> = ids.filter_map(|id| self.provisional.remove(id)).collect();
-        if gone.is_empty() {
+        if self.guessed.is_empty() {
             return Ok(());
         }
-        let stays = |id: &u32| !gone.iter().any(|range| range.contains(id));
-        let keep: Vec<bool> = self.ids.all().iter().map(stays).collect();
+        let splats = engine.read()?;
+        let stays = |(ix, id)| !(self.guessed.contains(id) && is_replaced(&splats, ix));
+        let keep: Vec<bool> = self.ids.all().iter().enumerate().map(stays).collect();
         if keep.iter().any(|k| !k) {
             self.retain(&keep, engine)?;
         }
@@ -173,7 +174,7 @@ impl SplatSet {
     pub(crate) fn number(&mut self, engine: &dyn Engine) {
         if self.ids.grow_to(engine.len()) {
             self.is_renumbered = true;
-            self.provisional.clear();
+            self.guessed.clear();
         }
         self.note_peaks(engine);
     }

@@ -2,10 +2,12 @@
 
 use std::sync::Arc;
 
+use glam::DVec3;
 use rand::Rng;
 
 use crate::mapper::params::RelocationRule;
 use crate::mapper::parts::Parts;
+use crate::mapper::splats::seeds::Seeds;
 use crate::mapper::train::seed::{self, SeedView};
 use crate::mapper::train::transient;
 use splat_engine::error::EngineError;
@@ -21,8 +23,6 @@ use splat_types::transform::Rigid;
 /// is not under optimisation, and its splats are no measure of anything.
 const ACTIVE_ROUNDS: usize = 4;
 const MIN_ACTIVE_STEPS: usize = 500;
-/// Splats that stand in for depth are so many times fewer than those that depth seeds.
-const PROVISIONAL_PART: usize = 4;
 
 /// Splats where a keyframe's depth says that the map has a hole or is wrong.
 pub(crate) fn seed_from(
@@ -37,26 +37,45 @@ pub(crate) fn seed_from(
     };
     let budget = map.params.train.seeds_per_keyframe;
     let seeds = seeds(map, rng, (keyframe_id, &depth), fills_gaps, budget)?;
-    if !seeds.is_empty() {
-        map.splats.append(&seeds, map.engine)?;
-    }
-    Ok(())
+    map.splats.append_seeds(&seeds, map.engine)
 }
 
-/// Coarse splats that stand in until a keyframe's depth comes, from that of its landmarks.
+/// Splats that stand in until a keyframe's depth comes, from that of its landmarks.
 pub(crate) fn seed_provisional(
     map: &mut Parts<'_>,
     rng: &mut impl Rng,
     keyframe_id: u32,
     depth: &DepthMap,
 ) -> Result<(), EngineError> {
-    let budget = (map.params.train.seeds_per_keyframe / PROVISIONAL_PART).max(1);
-    let seeds = seeds(map, rng, (keyframe_id, depth), true, budget)?;
-    if !seeds.is_empty() {
-        let engine = &mut *map.engine;
-        map.splats.append_provisional(keyframe_id, &seeds, engine)?;
-    }
-    Ok(())
+    let budget = map.params.train.seeds_per_keyframe;
+    let mut seeds = seeds(map, rng, (keyframe_id, depth), true, budget)?;
+    seeds.is_guess.fill(true);
+    map.splats.append_seeds(&seeds, map.engine)
+}
+
+/// Guessed splats go where a keyframe's depth, new or better, says more: those that it was given itself, and what others guessed
+/// at or before a surface that it has verified.
+pub(crate) fn take_guesses(map: &mut Parts<'_>, keyframe_id: u32) -> Result<(), EngineError> {
+    let Some((lens, cam_from_world)) = camera(map, keyframe_id)? else {
+        return Ok(());
+    };
+    let Some(registered) = map.keyframes.registered().get(&keyframe_id) else {
+        return Ok(());
+    };
+    let depth = &registered.depth;
+    let lens = lens.resized(depth.width_px, depth.height_px);
+    let is_replaced = |splats: &Splats, ix: usize| {
+        if splats.anchors[ix] == keyframe_id {
+            return true;
+        }
+        let mean = DVec3::from(splats.means[ix].map(f64::from));
+        let in_cam = cam_from_world.transform_point(mean);
+        let pixel = lens.project(in_cam);
+        let at = pixel.and_then(|pixel| depth.pixel_at(pixel));
+        let verified = at.and_then(|at| depth.verified(at));
+        verified.is_some_and(|(z, _)| in_cam.z < f64::from(seed::DEPTH_RATIO * z))
+    };
+    map.splats.take_guesses(is_replaced, map.engine)
 }
 
 fn seeds(
@@ -65,16 +84,16 @@ fn seeds(
     (keyframe_id, depth): (u32, &DepthMap),
     fills_gaps: bool,
     budget: usize,
-) -> Result<Splats, EngineError> {
+) -> Result<Seeds, EngineError> {
     let room = map
         .splats
         .cap(map.params, map.keyframes, map.engine)
         .saturating_sub(map.engine.len());
     if room == 0 {
-        return Ok(Splats::default());
+        return Ok(Seeds::default());
     }
     let Some(camera) = camera(map, keyframe_id)? else {
-        return Ok(Splats::default());
+        return Ok(Seeds::default());
     };
     let rendering = shown(map, &camera, 0)?;
     let Some(registered) = map
@@ -83,7 +102,7 @@ fn seeds(
         .get(&keyframe_id)
         .filter(|p| !p.is_held_out)
     else {
-        return Ok(Splats::default());
+        return Ok(Seeds::default());
     };
     let view = SeedView {
         keyframe_id,
@@ -96,6 +115,8 @@ fn seeds(
     };
     let mut seeds = seed::seed(&view, budget, map.params.train.sh_degree, rng);
     seeds.truncate(room);
+    let n_seeds = seeds.splats.len();
+    tracing::debug!(keyframe_id, n_seeds, fills_gaps, "seeded");
     Ok(seeds)
 }
 

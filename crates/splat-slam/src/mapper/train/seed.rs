@@ -6,6 +6,7 @@
 use glam::{DVec2, DVec3};
 use rand::{Rng, RngExt};
 
+use crate::mapper::splats::seeds::Seeds;
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
@@ -23,7 +24,7 @@ const OPACITY_LOGIT: f32 = 0.4;
 /// Below this the map has nothing there.
 const EMPTY_ALPHA: f32 = 0.5;
 /// The map's surface lies this much behind a verified one: it is wrong there.
-const DEPTH_RATIO: f32 = 1.15;
+pub(crate) const DEPTH_RATIO: f32 = 1.15;
 /// Mean absolute colour error from which a pixel asks for seeds, and at which it asks fully.
 const ERROR_FROM: f32 = 0.06;
 const ERROR_FULL: f32 = 0.25;
@@ -47,7 +48,7 @@ pub struct SeedView<'a> {
 }
 
 /// At most about `budget` seeds would fill the whole image; an image that the map covers already gets few.
-pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rng) -> Splats {
+pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rng) -> Seeds {
     let (width, height) = (view.image.width_px as usize, view.image.height_px as usize);
     let filled = view.fills_gaps.then(|| fill_gaps(view.depth));
     let detail = detail(view.image);
@@ -59,6 +60,7 @@ pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rn
         .collect();
     // Dividing by the whole image keeps the density the same whether much or little is missing.
     let rate = budget as f64 / (width * height) as f64;
+    let mut is_guess = Vec::new();
     let mut splats = Splats {
         sh_degree,
         ..Splats::default()
@@ -69,7 +71,7 @@ pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rn
         if chance <= 0.0 || rng.random::<f64>() >= chance {
             continue;
         }
-        let Some((depth, _)) = depth_at(view, filled.as_deref(), p) else {
+        let Some((depth, is_verified)) = depth_at(view, filled.as_deref(), p) else {
             continue;
         };
         let spacing_px = (f64::from(detail[p]) * rate)
@@ -96,8 +98,9 @@ pub fn seed(view: &SeedView<'_>, budget: usize, sh_degree: u8, rng: &mut impl Rn
             .sh
             .extend(colour.iter().map(|c| (f32::from(*c) / 255.0 - 0.5) / SH_C0));
         splats.sh.resize(splats.means.len() * stride, 0.0);
+        is_guess.push(!is_verified);
     }
-    splats
+    Seeds { splats, is_guess }
 }
 
 /// Depth of an image pixel and whether it was verified.
@@ -261,7 +264,7 @@ mod tests {
             rendering,
             fills_gaps,
         };
-        seed(&view, 500, 1, &mut Pcg64Mcg::seed_from_u64(1))
+        seed(&view, 500, 1, &mut Pcg64Mcg::seed_from_u64(1)).splats
     }
 
     #[test]

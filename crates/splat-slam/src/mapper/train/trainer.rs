@@ -177,9 +177,12 @@ impl Trainer {
         &mut self,
         map: &mut Parts<'_>,
         ids: &[u32],
+        fills_gaps: bool,
     ) -> Result<(), EngineError> {
-        ids.iter()
-            .try_for_each(|id| grow_prune::seed_from(map, &mut self.rng, *id, false))
+        ids.iter().try_for_each(|id| {
+            grow_prune::take_guesses(map, *id)?;
+            grow_prune::seed_from(map, &mut self.rng, *id, fills_gaps)
+        })
     }
 
     /// Splats for a keyframe without depth, from where its landmarks are.
