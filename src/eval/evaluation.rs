@@ -220,6 +220,17 @@ impl std::fmt::Display for Evaluation {
                     figure(quality.ssim_holdout),
                     figure(quality.lpips_holdout),
                 )?;
+                // Reports of 0.1.0 have none.
+                if quality.psnr_holdout_half.is_some() {
+                    writeln!(
+                        f,
+                        "right halves     PSNR {} dB, SSIM {}; with the exposure of the left halves {} dB, {}",
+                        figure(quality.psnr_holdout_half),
+                        figure(quality.ssim_holdout_half),
+                        figure(quality.psnr_holdout_exposed),
+                        figure(quality.ssim_holdout_exposed),
+                    )?;
+                }
             }
             writeln!(f, "training views   PSNR {} dB", figure(quality.psnr_train))?;
         }

@@ -8,6 +8,8 @@ pub mod numbers;
 
 pub mod image_metrics;
 
+pub mod exposure_fit;
+
 pub mod lpips;
 
 pub mod params;

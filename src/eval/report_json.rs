@@ -155,6 +155,12 @@ pub struct Quality {
     pub psnr_train: Option<f64>,
     pub psnr_holdout: Option<f64>,
     pub ssim_holdout: Option<f64>,
+    /// Of the right halves of held-out views, as rendered
+    pub psnr_holdout_half: Option<f64>,
+    pub ssim_holdout_half: Option<f64>,
+    /// and with the exposure that fits their left halves.
+    pub psnr_holdout_exposed: Option<f64>,
+    pub ssim_holdout_exposed: Option<f64>,
     /// By the network of `eval.lpips_model`; null without one.
     pub lpips_holdout: Option<f64>,
 }

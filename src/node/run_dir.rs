@@ -13,6 +13,7 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt as log_format};
 
+use crate::eval::exposure_fit::{HalfScores, half_scores};
 use crate::eval::frames::{self, FrameRow, Source as Known};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
@@ -276,7 +277,7 @@ fn measure_quality(
     let progress = outcome.progress();
     let mut measure = |ids: &[u32], is_held_out: bool, max_images: usize| {
         let image_stride = ids.len().div_ceil(max_images).max(1);
-        let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut psnrs, mut held_out) = (Vec::new(), HeldOutScores::default());
         for (i, id) in ids.iter().enumerate() {
             if fault.is_some() {
                 break;
@@ -298,8 +299,7 @@ fn measure_quality(
             let psnr = rendering.psnr(&photo);
             psnrs.push(psnr);
             if is_held_out {
-                ssims.push(image_metrics::ssim(&rendering.rgb, &photo));
-                distances.extend(lpips_of(&mut lpips, &rendering, &photo));
+                held_out.add(&rendering, &photo, &mut lpips);
             }
             if i % image_stride == 0 {
                 images.push(Comparison {
@@ -311,13 +311,10 @@ fn measure_quality(
                 });
             }
         }
-        // A mean over some of the views would be another figure.
-        let is_whole = distances.len() == psnrs.len();
-        let distance = mean(&distances).filter(|_| is_whole);
-        (mean(&psnrs), mean(&ssims), distance)
+        (mean(&psnrs), held_out)
     };
-    let (psnr_holdout, ssim_holdout, lpips_holdout) = measure(&held_out, true, MAX_HELD_OUT_IMAGES);
-    let (psnr_train, ..) = measure(&train, false, MAX_TRAIN_IMAGES);
+    let (psnr_holdout, scores) = measure(&held_out, true, MAX_HELD_OUT_IMAGES);
+    let (psnr_train, _) = measure(&train, false, MAX_TRAIN_IMAGES);
     if let Some(error) = fault {
         tracing::error!("engine: {error}; quality is not measured");
         // Of a run that has failed before, the first reason counts.
@@ -328,10 +325,39 @@ fn measure_quality(
         holdout_every: u64::from(holdout_every),
         psnr_train,
         psnr_holdout,
-        ssim_holdout,
-        lpips_holdout,
+        ssim_holdout: mean(&scores.ssims),
+        psnr_holdout_half: scores.half_mean(|half| half.psnr),
+        ssim_holdout_half: scores.half_mean(|half| half.ssim),
+        psnr_holdout_exposed: scores.half_mean(|half| half.psnr_exposed),
+        ssim_holdout_exposed: scores.half_mean(|half| half.ssim_exposed),
+        lpips_holdout: scores.lpips(),
     };
     (quality, images)
+}
+
+/// What is measured of held-out views beside PSNR.
+#[derive(Default)]
+struct HeldOutScores {
+    ssims: Vec<f64>,
+    halves: Vec<HalfScores>,
+    distances: Vec<f64>,
+}
+
+impl HeldOutScores {
+    fn add(&mut self, rendering: &Rendering, photo: &RgbImage, lpips: &mut Option<Lpips>) {
+        self.ssims.push(image_metrics::ssim(&rendering.rgb, photo));
+        self.halves.push(half_scores(rendering, photo));
+        self.distances.extend(lpips_of(lpips, rendering, photo));
+    }
+
+    fn half_mean(&self, score: impl Fn(&HalfScores) -> f64) -> Option<f64> {
+        mean(&self.halves.iter().map(score).collect::<Vec<f64>>())
+    }
+
+    /// A mean over some of the views would be another figure.
+    fn lpips(&self) -> Option<f64> {
+        mean(&self.distances).filter(|_| self.distances.len() == self.ssims.len())
+    }
 }
 
 /// Held-out views, and training views, that quality is measured by.

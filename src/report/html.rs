@@ -13,7 +13,7 @@ use crate::eval::alignment::align;
 use crate::eval::error::{EvalError, write_atomically};
 use crate::eval::evaluation::{Evaluation, compare};
 use crate::eval::numbers::{count, decibels, figure, mebibytes, milliseconds, ordinal};
-use crate::eval::report_json::Report;
+use crate::eval::report_json::{Quality, Report};
 use crate::eval::trajectory::{TOLERANCE_SECS, TimedPose, associate};
 use crate::report::charts::{Curve, Paths, View, bars, curve_chart, trajectory_chart};
 use crate::report::comparisons::{Comparison, comparisons};
@@ -239,12 +239,7 @@ fn times(report: &Report) -> Markup {
 }
 
 fn figures(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
-    let (frames, latency, quality, scale) = (
-        &report.frames,
-        &report.latency_ms,
-        &report.quality,
-        &report.scale,
-    );
+    let (frames, latency, scale) = (&report.frames, &report.latency_ms, &report.scale);
     let mut rows = vec![
         ("frames received", count(frames.received)),
         ("frames dropped", count(frames.dropped)),
@@ -268,16 +263,9 @@ fn figures(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
                 report.load_shed.depth_s, report.load_shed.steps_s
             ),
         ),
-        (
-            "PSNR of training views",
-            format!("{} dB", decibels(quality.psnr_train)),
-        ),
-        (
-            "PSNR of held-out views",
-            format!("{} dB", decibels(quality.psnr_holdout)),
-        ),
-        ("SSIM of held-out views", figure(quality.ssim_holdout)),
-        ("LPIPS of held-out views", figure(quality.lpips_holdout)),
+    ];
+    rows.extend(quality_figures(&report.quality));
+    rows.extend([
         (
             "keyframe to pose, 50 % and 95 %",
             format!(
@@ -299,7 +287,7 @@ fn figures(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
         ("scale", scale.source.replace('_', " ")),
         ("metres per unit", figure(scale.metres_per_unit)),
         ("SHA-256 of map.ply", report.map_sha256.clone()),
-    ];
+    ]);
     if let Some(evaluation) = evaluation {
         rows.push(("reference poses", count(evaluation.reference as u64)));
     }
@@ -309,6 +297,37 @@ fn figures(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
             div.card.columns { table { @for (name, value) in &rows { tr { th scope="row" { (name) } td.num { (value) } } } } }
         }
     }
+}
+
+fn quality_figures(quality: &Quality) -> [(&'static str, String); 6] {
+    [
+        (
+            "PSNR of training views",
+            format!("{} dB", decibels(quality.psnr_train)),
+        ),
+        (
+            "PSNR of held-out views",
+            format!("{} dB", decibels(quality.psnr_holdout)),
+        ),
+        ("SSIM of held-out views", figure(quality.ssim_holdout)),
+        (
+            "right halves of held-out views, PSNR and SSIM",
+            format!(
+                "{} dB, {}",
+                decibels(quality.psnr_holdout_half),
+                figure(quality.ssim_holdout_half)
+            ),
+        ),
+        (
+            "the same with the exposure of the left halves",
+            format!(
+                "{} dB, {}",
+                decibels(quality.psnr_holdout_exposed),
+                figure(quality.ssim_holdout_exposed)
+            ),
+        ),
+        ("LPIPS of held-out views", figure(quality.lpips_holdout)),
+    ]
 }
 
 /// Those that differ from their defaults stand first and open.

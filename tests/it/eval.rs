@@ -368,6 +368,8 @@ fn the_json_of_an_evaluation_has_the_promised_keys() {
     let quality = Quality {
         holdout_every: 8,
         psnr_holdout: Some(24.5),
+        psnr_holdout_half: Some(24.25),
+        psnr_holdout_exposed: Some(25.75),
         ..Quality::default()
     };
     Report {
@@ -391,9 +393,14 @@ fn the_json_of_an_evaluation_has_the_promised_keys() {
         assert!(json[key].is_number(), "{key}: {json}");
     }
     assert_eq!(json["quality"]["psnr_holdout"], 24.5);
+    assert_eq!(json["quality"]["psnr_holdout_exposed"], 25.75);
     let text = figures.to_string();
     assert!(
         text.contains("5 of 5") && text.contains("PSNR 24.5000 dB") && text.contains("every 8th"),
+        "{text}"
+    );
+    assert!(
+        text.contains("PSNR 24.2500 dB") && text.contains("the left halves 25.7500 dB"),
         "{text}"
     );
 }

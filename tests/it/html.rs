@@ -178,6 +178,8 @@ fn the_page_is_whole_and_fetches_nothing() {
     for text in [
         "fox, 50 frames",
         "23.87",
+        "23.52 dB, 0.783",
+        "24.06 dB, 0.786",
         "58,312",
         "every 8th keyframe",
         "held out",

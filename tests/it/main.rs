@@ -17,6 +17,7 @@ mod deltas;
 mod device_loss;
 mod eval;
 mod eval_lines;
+mod exposure;
 mod formats;
 mod gpu_runs;
 mod graphs;

@@ -59,8 +59,12 @@ peak_rss_mib
 quality.holdout_every
 quality.lpips_holdout
 quality.psnr_holdout
+quality.psnr_holdout_exposed
+quality.psnr_holdout_half
 quality.psnr_train
 quality.ssim_holdout
+quality.ssim_holdout_exposed
+quality.ssim_holdout_half
 scale.metres_per_unit
 scale.source
 scale.std
@@ -135,6 +139,10 @@ pub(crate) fn sample_report() -> Report {
             psnr_train: Some(26.31),
             psnr_holdout: Some(23.87),
             ssim_holdout: Some(0.791),
+            psnr_holdout_half: Some(23.52),
+            ssim_holdout_half: Some(0.783),
+            psnr_holdout_exposed: Some(24.06),
+            ssim_holdout_exposed: Some(0.786),
             lpips_holdout: None,
         },
         budgets: Budgets {
