@@ -176,7 +176,7 @@ struct SynthArgs {
     lens: Option<String>,
     #[arg(long)]
     seed: Option<u64>,
-    /// One more option, for example noise=2, exposure=0.3, blur=0.5; repeatable
+    /// One more option, for example rate=30 (frames per second), noise=2, exposure=0.3, blur=0.5; repeatable
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }

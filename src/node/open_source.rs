@@ -119,7 +119,7 @@ fn open_synthetic(
     seed: u64,
 ) -> Result<Box<dyn Source>, SourceError> {
     if scene.split('?').next() == Some("endless") {
-        return Ok(Box::new(EndlessSource::open(scene)?));
+        return Ok(Box::new(EndlessSource::open(scene, params)?));
     }
     Ok(Box::new(SyntheticSource::open(scene, params, seed)?))
 }

@@ -68,7 +68,7 @@ impl Walk {
             GroundTruthModel::new(all.ground_truth, (&all.sfm, &all.mvs), Some(1.0), 7).unwrap();
         let pages = pages(&params);
         Self {
-            source: EndlessSource::open(corridor).unwrap(),
+            source: EndlessSource::open(corridor, &all.source).unwrap(),
             model,
             map: Mapper::new(params, 3, Scale::GIVEN, engine).paging_to(pages),
             next_id: 0,

@@ -7,13 +7,16 @@ use glam::DVec2;
 use crate::synthetic::{colour, median};
 use splat_io::frame_source::Source;
 use splat_io::params::SourceParams;
+use splat_mapper::node::open_source::open;
 use splat_mapper::params::settings::Settings;
 use splat_msgs::ros::{self, CameraInfo, CompressedImage, PoseStamped, TfMessage};
 use splat_synth::record::{truth_tum, write_recording};
 use splat_synth::settings::{LensKind, SynthSettings};
 use splat_synth::source::SyntheticSource;
 use splat_synth::take::Take;
+use splat_types::frame::Frame;
 use splat_types::image::RgbImage;
+use splat_types::time::Stopwatch;
 
 fn source_params() -> SourceParams {
     Settings::shipped().params().unwrap().source
@@ -59,6 +62,65 @@ fn the_source_hands_out_frames_with_truth() {
         "all of the room is near"
     );
     assert!(frame.truth.is_some());
+}
+
+#[test]
+fn a_rate_changes_when_frames_are_taken_and_not_how_the_camera_moves() {
+    let film = |rate: &str| {
+        let scene = format!("room?frames=31&width=32&height=24&exposure=0.5{rate}");
+        let mut source = SyntheticSource::open(&scene, &source_params(), 3).unwrap();
+        std::iter::from_fn(|| source.next()).collect::<Vec<Frame>>()
+    };
+    let (shipped, ten, fast) = (film(""), film("&rate=10"), film("&rate=30"));
+    let is_same = |a: &Frame, b: &Frame| {
+        (a.stamp, a.truth, &a.image.pixels) == (b.stamp, b.truth, &b.image.pixels)
+    };
+    assert!(shipped.iter().zip(&ten).all(|(a, b)| is_same(a, b)));
+    // 30 frames later it is one second later, whatever frames lie between.
+    assert_eq!(fast[30].stamp, shipped[10].stamp);
+    assert_eq!(
+        fast[1].stamp.nanos - fast[0].stamp.nanos,
+        33_333_333,
+        "1/30 s"
+    );
+    for ix in 0..=10 {
+        let (slow, fast) = (&shipped[ix], &fast[3 * ix]);
+        let (a, b) = (slow.truth.unwrap(), fast.truth.unwrap());
+        assert!(a.translation.distance(b.translation) < 1e-12 && a.angle_to(&b) < 1e-9);
+        let pixels = slow.image.pixels.iter().zip(&fast.image.pixels);
+        assert!(
+            pixels.into_iter().all(|(a, b)| a.abs_diff(*b) <= 1),
+            "frame {ix}: motion and exposure by time"
+        );
+    }
+}
+
+#[test]
+fn a_rate_is_kept_to_live_alone() {
+    let secs = |scene: &str, rate: f64| {
+        let params = SourceParams {
+            rate,
+            ..source_params()
+        };
+        let mut source = open(&format!("synthetic:{scene}"), &params, 0).unwrap();
+        let watch = Stopwatch::start();
+        assert_eq!(std::iter::from_fn(|| source.next()).count(), 16);
+        watch.secs()
+    };
+    for scene in [
+        "room?frames=16&width=16&height=16&rate=",
+        "endless?frames=16&width=16&height=16&rate=",
+    ] {
+        // The last frame is half a second behind the first.
+        let live = secs(&format!("{scene}30"), 1.0);
+        assert!(live > 0.499, "{scene}: {live} s");
+        // At this rate it would take 15 s, in a replay it takes what drawing takes.
+        let replayed = secs(&format!("{scene}1"), 0.0);
+        assert!(replayed < 7.0, "{scene}: {replayed} s");
+    }
+    // Without a rate frames come as soon as they are drawn, live, too: at this speed they would take 15 s.
+    let unpaced = secs("room?frames=16&width=16&height=16", 0.1);
+    assert!(unpaced < 7.0, "{unpaced} s");
 }
 
 #[test]
@@ -129,6 +191,12 @@ fn a_wrong_scene_or_option_is_refused_with_what_would_be_right() {
         ("room?fov=120", "unless the lens is fisheye"),
         ("room?lens=zoom", "pinhole, radial or fisheye"),
         ("room?noise=-1", "[0, 64]"),
+        ("room?rate=0", "[1, 1000]"),
+        ("room?rate=-30", "[1, 1000]"),
+        ("room?rate=NaN", "[1, 1000]"),
+        ("room?rate=inf", "[1, 1000]"),
+        ("room?rate=1e9", "[1, 1000]"),
+        ("room?rate=", "[1, 1000]"),
         ("room?seed=-1", "2^64"),
         ("room?depth", "true or false"),
         ("room?=&&?", "unknown option"),

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::time::Duration;
 
 use crate::calibration::lens_for_size;
 use crate::frame_source::SourceCounts;
+use crate::pace::Pace;
 use crate::params::SourceParams;
 use splat_image::buffer_pool::Pool;
 use splat_image::pixel_format::resize;
@@ -14,11 +14,8 @@ use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::depth::DepthMap;
 use splat_types::frame::Frame;
 use splat_types::image::{Filter, Resampler, RgbImage};
-use splat_types::time::{Stamp, Stopwatch};
+use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
-
-/// Longest wait between two frames of a paced replay, so that a jump of the recording's clock does not stop it.
-const MAX_WAIT_SECS: f64 = 2.0;
 
 /// What a source knows of an image besides its pixels.
 #[derive(Debug, Default)]
@@ -60,7 +57,7 @@ pub struct Intake {
     n_frames: u64,
     counts: SourceCounts,
     warned: BTreeSet<&'static str>,
-    pace: Option<(Stopwatch, Stamp)>,
+    pace: Pace,
 }
 
 impl Intake {
@@ -75,7 +72,7 @@ impl Intake {
             n_frames: 0,
             counts: SourceCounts::default(),
             warned: BTreeSet::new(),
-            pace: None,
+            pace: Pace::new(params.rate),
         }
     }
 
@@ -205,7 +202,7 @@ impl Intake {
             .map(|depth| Arc::new(fit_depth(&depth, working)));
         self.last_stamp = Some(arrival.stamp);
         self.n_frames += 1;
-        self.wait_for(arrival.stamp);
+        self.pace.wait_for(arrival.stamp);
         Frame {
             seq: arrival.seq,
             stamp: arrival.stamp,
@@ -272,24 +269,6 @@ impl Intake {
         self.resampler.resize(&image, &mut out, Filter::Lanczos3);
         self.pool.take_back(image);
         out
-    }
-
-    /// Holds a frame back until its time has come.
-    fn wait_for(&mut self, stamp: Stamp) {
-        if self.params.rate <= 0.0 {
-            return;
-        }
-        let Some((watch, first)) = self.pace else {
-            self.pace = Some((Stopwatch::start(), stamp));
-            return;
-        };
-        let wait = stamp.secs_since(first) / self.params.rate - watch.secs();
-        if wait > MAX_WAIT_SECS {
-            std::thread::sleep(Duration::from_secs_f64(MAX_WAIT_SECS));
-            self.pace = Some((Stopwatch::start(), stamp));
-        } else if wait > 0.0 {
-            std::thread::sleep(Duration::from_secs_f64(wait));
-        }
     }
 }
 

@@ -22,6 +22,8 @@ pub mod frame_source;
 
 pub mod params;
 
+pub mod pace;
+
 pub mod intake;
 
 pub mod ros_image;

@@ -2,7 +2,8 @@
 //! of thousands of them can be tested.
 //!
 //! The camera walks along +x and looks half ahead at the left wall; after `turn` frames it walks back, still looking
-//! there. `synthetic:endless?frames=2000&turn=1000&width=96&height=72&step=0.1`. Metres.
+//! there. `synthetic:endless?frames=2000&turn=1000&width=96&height=72&step=0.1&rate=30`. `step` is metres in a fifteenth of
+//! a second, at any rate.
 
 use std::f64::consts::PI;
 use std::path::PathBuf;
@@ -13,8 +14,11 @@ use rayon::prelude::*;
 
 use crate::noise::{hash2, pick, value_noise};
 use crate::paint::hue;
+use crate::settings::RATES;
 use splat_io::error::SourceError;
 use splat_io::frame_source::{Source, SourceCounts};
+use splat_io::pace::Pace;
+use splat_io::params::SourceParams;
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
 use splat_types::frame::Frame;
@@ -28,42 +32,48 @@ const PANEL: f64 = 0.6;
 const FOV_DEG: f64 = 66.0;
 /// Between the walk and where the camera looks.
 const HEADING: f64 = PI / 3.0;
-const FRAMES_PER_SEC: f64 = 15.0;
+/// Frames per second where none are asked for.
+const RATE: f64 = 15.0;
 
-/// Films on demand.
-#[derive(Debug, Clone, PartialEq)]
+/// Films on demand; live, one with a rate of its own hands frames out at that rate.
+#[derive(Debug, Clone)]
 pub struct EndlessSource {
     n_frames: u64,
     /// Frames after which it walks back, and forth again.
     turn: u64,
     step: f64,
+    /// Frames per second.
+    rate: f64,
     lens: Intrinsics,
     next_ix: u64,
+    pace: Pace,
 }
 
 impl EndlessSource {
     /// `scene` is what follows `synthetic:`.
-    pub fn open(scene: &str) -> Result<Self, SourceError> {
+    pub fn open(scene: &str, params: &SourceParams) -> Result<Self, SourceError> {
         let mut source = Self {
             n_frames: 2000,
             turn: u64::MAX,
             step: 0.1,
+            rate: RATE,
             lens: lens(96, 72),
             next_ix: 0,
+            pace: Pace::new(0.0),
         };
         let (_, options) = scene.split_once('?').unwrap_or((scene, ""));
         for option in options.split('&').filter(|option| !option.is_empty()) {
-            source.set(option).ok_or_else(|| SourceError::Open {
+            source.set(option, params).ok_or_else(|| SourceError::Open {
                 what: "the synthetic scene",
                 reason: format!("option {option:?}"),
-                way_out: "expected frames and turn in [1, 1000000], width and height in [16, 1024] px or step in [0.001, 1] m",
+                way_out: "expected frames and turn in [1, 1000000], width and height in [16, 1024] px, step in [0.001, 1] m or rate in [1, 1000] Hz",
                 path: PathBuf::from(scene),
             })?;
         }
         Ok(source)
     }
 
-    fn set(&mut self, option: &str) -> Option<()> {
+    fn set(&mut self, option: &str, params: &SourceParams) -> Option<()> {
         let (key, value) = option.split_once('=')?;
         let number: f64 = value.parse().ok()?;
         let within = |low: f64, high: f64| (low..=high).contains(&number).then_some(number);
@@ -74,6 +84,10 @@ impl EndlessSource {
             "width" => self.lens = lens(within(16.0, 1024.0)? as u32, k.height_px),
             "height" => self.lens = lens(k.width_px, within(16.0, 1024.0)? as u32),
             "step" => self.step = within(0.001, 1.0)?,
+            "rate" => {
+                self.rate = within(RATES[0], RATES[1])?;
+                self.pace = Pace::new(params.rate);
+            }
             _ => return None,
         }
         Some(())
@@ -86,7 +100,8 @@ impl EndlessSource {
         } else {
             self.turn - rest
         };
-        let t = forward as f64;
+        // So the motion per second is the same at any rate.
+        let t = forward as f64 * (RATE / self.rate);
         let at = DVec3::new(
             self.step * t,
             0.1 * (0.07 * t).sin(),
@@ -134,9 +149,11 @@ impl Source for EndlessSource {
         self.next_ix += 1;
         let pose = self.pose(ix);
         let (image, depth) = self.look(&pose);
+        let stamp = Stamp::from_secs(ix as f64 / self.rate);
+        self.pace.wait_for(stamp);
         Some(Frame {
             seq: ix,
-            stamp: Stamp::from_secs(ix as f64 / FRAMES_PER_SEC),
+            stamp,
             image: Arc::new(image),
             intrinsics: Some(self.lens),
             truth: Some(pose),
@@ -223,9 +240,13 @@ fn paint(at: DVec2, surface: u32) -> Vec3 {
 mod tests {
     use super::*;
 
+    fn open(scene: &str) -> Result<EndlessSource, SourceError> {
+        EndlessSource::open(scene, &SourceParams::default())
+    }
+
     #[test]
     fn it_walks_on_turns_and_shows_the_same_again() {
-        let mut source = EndlessSource::open("endless?frames=9&turn=4&width=32&height=24").unwrap();
+        let mut source = open("endless?frames=9&turn=4&width=32&height=24").unwrap();
         let frames: Vec<Frame> = std::iter::from_fn(|| source.next()).collect();
         assert_eq!(frames.len(), 9);
         let place = |ix: usize| frames[ix].truth.unwrap().translation;
@@ -236,14 +257,33 @@ mod tests {
         let depth = frames[0].sensor_depth.as_ref().unwrap();
         let median = depth.median().unwrap();
         assert!((0.8..3.0).contains(&median), "{median}");
-        for wrong in ["endless?frames=0", "endless?fov=3", "endless?step"] {
-            EndlessSource::open(wrong).unwrap_err();
+        for wrong in [
+            "endless?frames=0",
+            "endless?fov=3",
+            "endless?step",
+            "endless?rate=0",
+            "endless?rate=-1",
+            "endless?rate=NaN",
+            "endless?rate=1e9",
+        ] {
+            let message = open(wrong).unwrap_err().to_string();
+            assert!(message.contains("rate in [1, 1000] Hz"), "{message}");
         }
     }
 
     #[test]
+    fn it_walks_as_fast_at_any_rate() {
+        let last = |scene: &str| {
+            let mut source = open(&format!("{scene}&width=16&height=16")).unwrap();
+            std::iter::from_fn(|| source.next()).last().unwrap()
+        };
+        let (slow, fast) = (last("endless?frames=9"), last("endless?frames=17&rate=30"));
+        assert_eq!((slow.stamp, slow.truth), (fast.stamp, fast.truth));
+    }
+
+    #[test]
     fn depth_is_that_of_the_surface_that_is_seen() {
-        let source = EndlessSource::open("endless").unwrap();
+        let source = open("endless").unwrap();
         let pose = source.pose(7);
         let (_, depth) = source.look(&pose);
         for p in (0..depth.depth.len()).step_by(101) {

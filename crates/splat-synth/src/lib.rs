@@ -8,6 +8,8 @@ mod glyphs;
 
 mod paint;
 
+pub mod settings;
+
 pub mod endless;
 
 mod light;
@@ -17,8 +19,6 @@ mod ornaments;
 mod prints;
 
 mod paintings;
-
-pub mod settings;
 
 mod lens;
 

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use crate::settings::{FOV_DEG, LensKind, SceneKind, SynthError, SynthSettings};
+use crate::settings::{FOV_DEG, LensKind, RATE, RATES, SceneKind, SynthError, SynthSettings};
 
 const FISHEYE_FOV_DEG: f64 = 110.0;
 
@@ -42,6 +42,7 @@ impl SynthSettings {
                 "noise" => self.noise = number,
                 "exposure" => self.exposure_drift = number,
                 "blur" => self.blur = number,
+                "rate" => self.rate = Some(number),
                 "speed" => self.speed = number,
                 "odometry" => self.odometry = Some(number),
                 _ => self.jpeg_quality = number as u8,
@@ -87,6 +88,7 @@ impl SynthSettings {
                 "noise" => self.noise,
                 "exposure" => self.exposure_drift,
                 "blur" => self.blur,
+                "rate" => self.rate.unwrap_or(RATE),
                 "speed" => self.speed,
                 "odometry" => self.odometry.unwrap_or(0.0),
                 _ => f64::from(self.jpeg_quality),
@@ -143,7 +145,7 @@ impl Range {
     }
 }
 
-const RANGES: [Range; 10] = [
+const RANGES: [Range; 11] = [
     Range::new(
         "frames",
         [1.0, 100_000.0],
@@ -167,6 +169,7 @@ const RANGES: [Range; 10] = [
     Range::new("exposure", [0.0, 4.0], false, "stops in [0, 4]"),
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
     Range::new("odometry", [0.0, 1.0], false, "a share in [0, 1]"),
+    Range::new("rate", RATES, false, "frames per second in [1, 1000]"),
     Range::new("speed", [0.0, 100.0], false, "a number in [0, 100]"),
     Range::new("quality", [1.0, 100.0], true, "a whole number in [1, 100]"),
 ];

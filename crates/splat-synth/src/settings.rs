@@ -4,6 +4,10 @@ use std::path::PathBuf;
 
 /// Field of view of an ordinary webcam, and of a wide fisheye.
 pub(crate) const FOV_DEG: f64 = 66.0;
+/// Frames per second where none are asked for.
+pub(crate) const RATE: f64 = 10.0;
+/// What may be asked for, of all synthetic sources. A slower one would wait longer than any paced source does.
+pub(crate) const RATES: [f64; 2] = [1.0, 1000.0];
 
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
@@ -12,7 +16,7 @@ pub enum SynthError {
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
     #[error(
-        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, speed, seed, quality, depth, odometry"
+        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, rate, speed, seed, quality, depth, odometry"
     )]
     Option { key: String },
     #[error("option {key} of a synthetic scene = {found}, expected {expected}")]
@@ -66,7 +70,9 @@ pub struct SynthSettings {
     pub exposure_drift: f64,
     /// Share of the time between frames that the shutter is open.
     pub blur: f64,
-    /// 1 goes round once in 120 frames.
+    /// Frames per second, at which the source also hands them out live; `None`: 10, as soon as they are drawn.
+    pub rate: Option<f64>,
+    /// 1 goes round once in 12 s, whatever the rate.
     pub speed: f64,
     /// Sensor noise and the trembling of the hand follow from it; the scene is always the same.
     pub seed: u64,
@@ -90,6 +96,7 @@ impl SynthSettings {
             noise: 0.0,
             exposure_drift: 0.0,
             blur: 0.0,
+            rate: None,
             speed: 1.0,
             seed: 0,
             jpeg_quality: 85,

@@ -9,12 +9,13 @@ use crate::take::Take;
 use splat_image::undistort::Undistorter;
 use splat_io::error::SourceError;
 use splat_io::frame_source::{Source, SourceCounts};
+use splat_io::pace::Pace;
 use splat_io::params::SourceParams;
 use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
 use splat_types::transform::{Rigid, extent};
 
-/// Films on demand: each `next` renders one frame.
+/// Films on demand: each `next` renders one frame. Live, one with a rate of its own hands them out at that rate.
 #[derive(Debug)]
 pub struct SyntheticSource {
     take: Take,
@@ -24,6 +25,7 @@ pub struct SyntheticSource {
     odometry: Vec<Rigid>,
     /// Undistorts the images of distorted lenses.
     rectifier: Option<Undistorter>,
+    pace: Pace,
 }
 
 impl SyntheticSource {
@@ -61,6 +63,7 @@ impl SyntheticSource {
             None
         };
         let n_frames = take.settings().n_frames;
+        let pace = Pace::new(take.settings().rate.map_or(0.0, |_| params.rate));
         let noise = take.settings().odometry;
         let track = noise.map_or_else(Vec::new, |noise| odometry::track(&take, noise));
         let mounted = odometry::base_from_cam();
@@ -70,6 +73,7 @@ impl SyntheticSource {
             n_frames,
             next_ix: 0,
             rectifier,
+            pace,
         })
     }
 }
@@ -93,14 +97,17 @@ impl Source for SyntheticSource {
         };
         // Depth belongs to straight images; half their size is as fine as any model's.
         let halved = |i: Intrinsics| i.resized(i.width_px.div_ceil(2), i.height_px.div_ceil(2));
+        let sensor_depth = intrinsics.map(|i| Arc::new(self.take.depth(ix, &halved(i))));
+        let stamp = self.take.stamp(ix);
+        self.pace.wait_for(stamp);
         Some(Frame {
             seq: u64::from(ix),
-            stamp: self.take.stamp(ix),
+            stamp,
             image: Arc::new(image),
             intrinsics,
             truth: Some(self.take.pose(ix)),
             odometry: self.odometry.get(ix as usize).copied(),
-            sensor_depth: intrinsics.map(|i| Arc::new(self.take.depth(ix, &halved(i)))),
+            sensor_depth,
             is_held_out: false,
         })
     }

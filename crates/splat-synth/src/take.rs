@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use crate::geometry::Ray;
 use crate::scene::Scene;
-use crate::settings::{SceneKind, SynthError, SynthSettings};
+use crate::settings::{RATE, SceneKind, SynthError, SynthSettings};
 use crate::{corridor, facade, hallway, noise, room, trajectory};
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::depth::DepthMap;
@@ -20,9 +20,8 @@ use splat_types::image::RgbImage;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
-/// Header stamps start here and go on at 10 Hz.
+/// Header stamps start here.
 const START_SECS: i64 = 1_700_000_000;
-const FRAME_NANOS: i64 = 100_000_000;
 
 /// Samples of a still image: a square turned so that no two share a row or column.
 const STILL: [[f64; 2]; 4] = [
@@ -65,7 +64,17 @@ impl Take {
     }
 
     pub fn stamp(&self, ix: u32) -> Stamp {
-        Stamp::from_nanos(START_SECS * 1_000_000_000 + i64::from(ix) * FRAME_NANOS)
+        let nanos = f64::from(ix) * 1e9 / self.rate();
+        Stamp::from_nanos(START_SECS * 1_000_000_000 + nanos.round() as i64)
+    }
+
+    fn rate(&self) -> f64 {
+        self.settings.rate.unwrap_or(RATE)
+    }
+
+    /// Tenths of a second until so many frames have passed.
+    fn tenths(&self, n_frames: f64) -> f64 {
+        n_frames * (RATE / self.rate())
     }
 
     /// `world_from_cam` with OpenCV axes; the world's z points up.
@@ -75,7 +84,7 @@ impl Take {
 
     /// Pose a share of the frame interval before or after the middle of an exposure.
     fn pose_beside(&self, ix: u32, share: f64) -> Rigid {
-        let secs = (f64::from(ix) + share) * FRAME_NANOS as f64 * 1e-9 * self.settings.speed;
+        let secs = self.tenths(f64::from(ix) + share) * 1e8 * 1e-9 * self.settings.speed;
         let hand = noise::hash((self.settings.seed ^ (self.settings.seed >> 32)) as u32);
         trajectory::gt_from_cam(self.settings.scene, secs, hand)
     }
@@ -204,7 +213,7 @@ impl Take {
 
     /// Slow wave of the automatic exposure; one period in about eight seconds.
     fn gain(&self, ix: u32) -> f32 {
-        let wave = (std::f64::consts::TAU * (f64::from(ix) / 83.0 + 0.13)).sin();
+        let wave = (std::f64::consts::TAU * (self.tenths(f64::from(ix)) / 83.0 + 0.13)).sin();
         (self.settings.exposure_drift * wave).exp2() as f32
     }
 }
