@@ -16,7 +16,7 @@ use splat_types::depth::DepthMap;
 use splat_types::frame::{Frame, Keyframe};
 use splat_types::image::RgbImage;
 use splat_types::time::{Stamp, Stopwatch};
-use splat_types::tracking::{TrackState, TrackedFrame};
+use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
 
 /// 10 Hz, at most 2 deg from frame to frame.
@@ -190,6 +190,37 @@ fn a_blackout_is_declared_and_over_as_soon_as_there_is_light() {
     assert_eq!(next.state, TrackState::Tracking);
     let tracks = tracker.finish(|| true);
     assert_eq!((tracks.n_lost, tracks.n_relocalised), (1, 1));
+}
+
+#[test]
+fn an_image_that_comes_again_says_nothing_of_where_the_camera_is() {
+    let frames = room();
+    let mut tracker = Tracker::new(&params());
+    tracker.update(&views(frames));
+    frames[..12].iter().for_each(|frame| {
+        tracker.track(frame);
+    });
+    let mut last_std = 0.0;
+    // The camera goes on, and its driver hands out the last image; as a copy, as drivers do.
+    for i in 12..18 {
+        let image = Arc::new((*frames[11].image).clone());
+        let tracked = tracker.track(&Frame {
+            image,
+            ..frames[i].clone()
+        });
+        let pose = tracked.pose.unwrap();
+        assert!(pose.is_predicted && tracked.reason == Some(LostReason::Repeated));
+        let std = pose.covariance[0][0].sqrt();
+        assert!(std > last_std, "{i}: {std} after {last_std}");
+        last_std = std;
+    }
+    assert_eq!(tracker.state(), TrackState::Lost);
+    let back = tracker.track(&frames[18]);
+    assert!(
+        is_right(&back, &frames[18]),
+        "{:?}",
+        error(&back, &frames[18])
+    );
 }
 
 #[test]

@@ -25,6 +25,8 @@ pub enum LostReason {
     NoCamera { width_px: u32, height_px: u32 },
     #[error("the image shows nothing to track: {n_corners} corners")]
     Blank { n_corners: usize },
+    #[error("the image is the one before, bit for bit")]
+    Repeated,
     #[error("no keyframe has looked there")]
     Unseen,
     #[error("{found} landmarks agree, {needed} are needed")]

@@ -23,6 +23,7 @@ use crate::track::params::TrackParams;
 use crate::track::refinement::FrameRef;
 use splat_types::covariance::Covariance;
 use splat_types::frame::Frame;
+use splat_types::image::RgbImage;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
@@ -81,8 +82,8 @@ pub struct Tracker {
     anchor: Option<Anchor>,
     odometry: MapOdometry,
     search: Search,
-    /// Of the frame before.
-    last_stamp: Option<Stamp>,
+    /// The frame before.
+    last: Option<(Stamp, Arc<RgbImage>)>,
     design: f64,
     /// Frames that get a second look when the map has reached them.
     waiting: VecDeque<Waiting>,
@@ -100,7 +101,7 @@ impl Tracker {
             anchor: None,
             odometry: MapOdometry::new(params.odometry),
             search: Search::default(),
-            last_stamp: None,
+            last: None,
             design: FIRST_DESIGN,
             waiting: VecDeque::new(),
             history: History::default(),
@@ -142,6 +143,16 @@ impl Tracker {
 
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
+        let tracked = if repeats(self.last.as_ref(), frame) {
+            self.repeated((frame.seq, frame.stamp))
+        } else {
+            self.look_at(frame)
+        };
+        self.last = Some((frame.stamp, Arc::clone(&frame.image)));
+        tracked
+    }
+
+    fn look_at(&mut self, frame: &Frame) -> TrackedFrame {
         let odometry = self.odometry.follow(frame);
         let linked = self.linked(frame.seq);
         if let Some((linked, pose)) = &linked
@@ -165,7 +176,7 @@ impl Tracker {
             (Err(reason), None) => {
                 match odometry.filter(|pose| self.odometry.reports_before_map(pose)) {
                     Some(pose) => return self.ahead_of_map(seen, &pose),
-                    None => self.missed(&seen, reason),
+                    None => self.missed((seen.seq, seen.stamp), reason),
                 }
             }
         };
@@ -188,7 +199,6 @@ impl Tracker {
         tracked: &TrackedFrame,
         segment: Option<u32>,
     ) {
-        self.last_stamp = Some(tracked.stamp);
         let anchor = self.anchor.filter(|_| tracked.is_measured());
         let history_ix = self.history.push(tracked, anchor);
         if let Some(segment) = segment {
@@ -214,7 +224,12 @@ impl Tracker {
     /// Takes over what the map says: all of its keyframes, with their poses of this moment.
     pub fn update(&mut self, views: &[KeyframeView]) {
         let before = self.anchor.and_then(|anchor| self.pose_by(&anchor));
-        let old_unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
+        let unit_of = |keyframes: &BTreeMap<u32, (Rigid, f64)>, anchor: Anchor| {
+            keyframes.get(&anchor.keyframe_id).map(|(_, unit)| *unit)
+        };
+        let old_unit = self
+            .anchor
+            .and_then(|anchor| unit_of(&self.keyframes, anchor));
         let kept = self.waiting.iter();
         let kept: BTreeMap<u64, &Arc<Observation>> = kept
             .filter_map(|w| Some((w.seq, w.seen.as_ref()?)))
@@ -234,7 +249,9 @@ impl Tracker {
             self.history.express_in_map(&initialisation);
         }
         let after = self.anchor.and_then(|anchor| self.pose_by(&anchor));
-        let unit = self.anchor.and_then(|anchor| self.unit_of(&anchor));
+        let unit = self
+            .anchor
+            .and_then(|anchor| unit_of(&self.keyframes, anchor));
         match (before.zip(after), self.motion.as_mut()) {
             (Some((before, after)), Some(motion)) => {
                 let unit = unit.zip(old_unit).map_or(1.0, |(new, old)| new / old);
@@ -356,7 +373,9 @@ impl Tracker {
 
     fn retry_frame(&mut self, waiting: &Waiting) {
         let frame = &self.history.frames[waiting.history_ix];
-        let id = self.keyframe_of(waiting.seq);
+        let mut held = self.landmarks.held.values();
+        let id = held.find(|held| held.seen.seq == waiting.seq);
+        let id = id.map(|held| held.id);
         if id.is_none() && frame.is_fitted {
             return;
         }
@@ -416,11 +435,6 @@ impl Tracker {
         found
     }
 
-    fn keyframe_of(&self, seq: u64) -> Option<u32> {
-        let mut held = self.landmarks.held.values();
-        held.find(|held| held.seen.seq == seq).map(|held| held.id)
-    }
-
     fn anchor_of(&self, located: &Localized) -> Anchor {
         let id = located.reference;
         let (world_from_key, unit) = self
@@ -443,18 +457,18 @@ impl Tracker {
         Some(*world_from_key * key_from_cam)
     }
 
-    fn unit_of(&self, anchor: &Anchor) -> Option<f64> {
-        self.keyframes
-            .get(&anchor.keyframe_id)
-            .map(|(_, unit)| *unit)
-    }
-
     fn scene_depth(&self) -> f64 {
         let reference = self
             .anchor
             .and_then(|a| self.landmarks.held.get(&a.keyframe_id));
         reference.map_or(1.0, crate::track::landmarks::StoredKeyframe::median_depth)
     }
+}
+
+/// No sensor gives the same image twice: one that comes again, bit for bit, is a camera or a driver that hangs. It shows
+/// where the camera was, not where it is.
+fn repeats(last: Option<&(Stamp, Arc<RgbImage>)>, frame: &Frame) -> bool {
+    last.is_some_and(|(_, image)| *image == frame.image)
 }
 
 fn place_variance(covariance: &Matrix6<f64>) -> f64 {

@@ -124,14 +124,43 @@ impl Tracker {
         }
     }
 
-    pub(super) fn missed(&mut self, seen: &Observation, reason: LostReason) -> TrackedFrame {
+    /// The image of the frame before has come again.
+    pub(super) fn repeated(&mut self, frame: (u64, Stamp)) -> TrackedFrame {
+        let reason = LostReason::Repeated;
+        let tracked = if self.motion.is_some() {
+            self.missed(frame, reason)
+        } else {
+            // There is nothing to carry on, and nothing is lost by it.
+            let is_lost = self.state == TrackState::Lost;
+            TrackedFrame {
+                seq: frame.0,
+                stamp: frame.1,
+                state: if is_lost {
+                    TrackState::Lost
+                } else {
+                    TrackState::Initialising
+                },
+                reason: Some(reason),
+                pose: None,
+                n_inliers: 0,
+            }
+        };
+        self.keep(None, &tracked, None);
+        tracked
+    }
+
+    pub(super) fn missed(
+        &mut self,
+        (seq, stamp): (u64, Stamp),
+        reason: LostReason,
+    ) -> TrackedFrame {
         self.search.n_failed += 1;
         let since = self
             .motion
             .as_ref()
-            .map(|motion| seen.stamp.secs_since(motion.stamp));
-        let last = self.last_stamp.unwrap_or(seen.stamp);
-        let wait = seen.stamp.secs_since(last) * LOOK_AHEAD;
+            .map(|motion| stamp.secs_since(motion.stamp));
+        let last = self.last.as_ref().map_or(stamp, |(last, _)| *last);
+        let wait = stamp.secs_since(last) * LOOK_AHEAD;
         // A keyframe that is gone leaves no motion, but a tracker that was somewhere.
         let is_late = since.is_none_or(|secs| secs + wait >= self.params.lost_secs);
         if self.state != TrackState::Initialising && self.state != TrackState::Lost {
@@ -144,13 +173,13 @@ impl Tracker {
         }
         let depth = self.scene_depth();
         let pose = self.motion.as_ref().map(|motion| TrackedPose {
-            world_from_cam: motion.ahead(seen.stamp).inverse(),
-            covariance: rows(&motion.covariance_ahead(seen.stamp, depth)),
+            world_from_cam: motion.ahead(stamp).inverse(),
+            covariance: rows(&motion.covariance_ahead(stamp, depth)),
             is_predicted: true,
         });
         TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
+            seq,
+            stamp,
             state: self.state,
             reason: Some(reason),
             pose,
