@@ -36,7 +36,9 @@ impl Tracker {
             self.history.n_lost += 1;
         }
         let was_elsewhere = self.odometry.registered_in_map();
-        let is_new = was_elsewhere || self.motion.is_none() && self.state == TrackState::Lost;
+        // Whoever was lost was not led here by the motion before: the search has found the place, or odometry from keyframes
+        // that are newer than the loss.
+        let is_new = was_elsewhere || self.state == TrackState::Lost;
         let anchor = self.anchor_of(located);
         self.search.found = Some(FoundFrame {
             seq: seen.seq,
