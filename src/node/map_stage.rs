@@ -251,7 +251,7 @@ impl MapStage {
         if let Some(live) = &mut self.live {
             live.since_last = Stopwatch::start();
         }
-        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_keyframes() as u64;
+        let cap = LIVE_STEPS_PER_KEYFRAME * self.map.n_mapped_keyframes() as u64;
         let target = (self.map.n_steps() + LIVE_STEPS_AT_ONCE).min(cap);
         let before = self.map.n_steps();
         self.step_until(target, publish);
@@ -262,6 +262,7 @@ impl MapStage {
     /// `map.finish_secs` has room for.
     pub(crate) fn finish(&mut self, publish: &mut Publish<'_>) -> Arc<Snapshot> {
         let watch = Stopwatch::start();
+        self.on_map(Mapper::settle_on_largest);
         if self.live.is_some() {
             self.finish_live(publish);
         } else {

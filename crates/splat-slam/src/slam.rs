@@ -150,6 +150,7 @@ impl Slam {
         }
         let rest = self.model.finish()?;
         self.integrate(None, &rest, &mut events)?;
+        self.mapper.settle_on_largest()?;
         let (first, last) = (self.mapper.n_steps(), self.params.mapper.train.steps);
         while self.mapper.n_steps() < last {
             let n_steps = self.mapper.n_steps();

@@ -7,9 +7,11 @@ mod evaluation;
 
 mod snapshots;
 
+mod parking;
+
 mod recovery;
 
-mod reports;
+pub mod reports;
 
 mod resumption;
 
@@ -127,6 +129,9 @@ impl Mapper {
         if update.has_moved {
             self.trainer.reset_convergence();
         }
+        if let Some(parked) = update.unparked {
+            self.unpark(parked)?;
+        }
         self.place(update.joined, PoseStd::default(), &geometry.observations)?;
         let (parts, trainer) = self.split();
         trainer.record_observations(&parts, &geometry.observations);
@@ -134,17 +139,23 @@ impl Mapper {
         own.extend(if self.submaps.prior().is_some() {
             self.register_resumed()?
         } else {
-            self.restart_from()?
+            self.follow_newest()?
         });
         let fresh = self.place(own, geometry.pose_error, &geometry.observations)?;
+        self.settle_in()?;
+        Ok(fresh)
+    }
+
+    /// After keyframes came or moved.
+    fn settle_in(&mut self) -> Result<(), EngineError> {
         self.enforce_budget(0)?;
+        self.share_budget();
         self.keyframes.subsample_old_depth(&mut *self.engine)?;
         let (mut parts, trainer) = self.split();
         trainer.match_views(&mut parts)?;
         self.set_anchor()?;
         self.splats.note_peaks(&*self.engine);
-        self.keep_good()?;
-        Ok(fresh)
+        self.keep_good()
     }
 
     /// One optimiser update per step, with seeding and removal at their intervals. Returns the steps made, which
@@ -177,6 +188,7 @@ impl Mapper {
             }
             self.report_renumbered();
             if n_steps.is_multiple_of(ROTATE_EVERY) {
+                self.share_budget();
                 self.rotate()?;
                 self.splats.note_peaks(&*self.engine);
             }
@@ -203,17 +215,6 @@ impl Mapper {
             .iter()
             .filter(|(_, p)| (p.home.is_here || p.home.copy.is_some()) && !p.home.rests)
             .map(|(id, registered)| (*id, registered.is_held_out))
-            .collect()
-    }
-
-    /// Keyframes per submap: the map's first, then those that have no known relation to it.
-    pub fn submaps(&self) -> Vec<usize> {
-        let own = self.keyframes.registered().len();
-        let detached = self.submaps.detached_counts();
-        (own > 0)
-            .then_some(own)
-            .into_iter()
-            .chain(detached.into_values())
             .collect()
     }
 
@@ -296,17 +297,6 @@ impl Mapper {
         Ok(views)
     }
 
-    fn restart_from(&mut self) -> Result<Vec<View>, EngineError> {
-        let (keyframes, splats) = (&mut self.keyframes, &mut self.splats);
-        let restarted = self
-            .submaps
-            .restart_from(keyframes, splats, &mut *self.engine)?;
-        if restarted.is_some() {
-            self.trainer.set_trainable(Vec::new());
-        }
-        Ok(restarted.unwrap_or_default())
-    }
-
     fn hold_anchor(&mut self) -> Result<(), EngineError> {
         let anchor = self.submaps.anchor();
         anchor.hold(&self.keyframes, &mut *self.engine)
@@ -328,6 +318,15 @@ impl Mapper {
 
     /// Keeps as many keyframes in memory as there may be, less room for those that come.
     fn enforce_budget(&mut self, n_coming: usize) -> Result<(), EngineError> {
+        let n_own = self.keyframes.n_resident() + n_coming;
+        let most = self.keyframes.max_resident(&self.params);
+        let n_lost = self.submaps.parked_mut().page_out(
+            most.saturating_sub(n_own),
+            &mut *self.engine,
+            &mut self.paging,
+            self.scale.params(),
+        )?;
+        self.keyframes.note_lost(n_lost);
         let has_left = self.keyframes.enforce_budget(
             n_coming,
             &self.params,
@@ -528,6 +527,7 @@ impl Mapper {
             }
         }
         self.keyframes.measure_scene();
+        self.share_budget();
         self.splats.prune(&self.params, &mut *self.engine)?;
         self.seed_all(&fresh, &deepened)?;
         self.seed_provisional(&fresh, world_from_submap.scale, observations)?;

@@ -63,6 +63,9 @@ pub(crate) struct StoredKeyframe {
 #[derive(Debug, Default)]
 pub(crate) struct Landmarks {
     pub(crate) held: BTreeMap<u32, StoredKeyframe>,
+    /// Those that the map has no place for, such as those of a submap that is parked: they may come back with it, and their
+    /// images need not be there by then.
+    aside: BTreeMap<u32, StoredKeyframe>,
 }
 
 impl Landmarks {
@@ -74,10 +77,13 @@ impl Landmarks {
         params: &TrackParams,
     ) {
         let ids: BTreeMap<u32, &KeyframeView> = views.iter().map(|v| (v.keyframe.id, v)).collect();
-        // A map that starts again from another submap has no place for the old ones.
-        self.held.retain(|id, _| ids.contains_key(id));
+        let (held, gone) = std::mem::take(&mut self.held)
+            .into_iter()
+            .partition(|(id, _)| ids.contains_key(id));
+        self.held = held;
+        self.aside.extend::<BTreeMap<u32, StoredKeyframe>>(gone);
         for (id, view) in ids {
-            let held = self.held.remove(&id);
+            let held = self.held.remove(&id).or_else(|| self.aside.remove(&id));
             let seen = match &held {
                 Some(held) => Arc::clone(&held.seen),
                 None if view.depth.width_px == 0 => continue,
@@ -90,6 +96,9 @@ impl Landmarks {
         }
         while self.held.len() > params.max_keyframes {
             self.drop_one();
+        }
+        while self.held.len() + self.aside.len() > params.max_keyframes {
+            self.aside.pop_first();
         }
     }
 

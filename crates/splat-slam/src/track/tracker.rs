@@ -294,7 +294,16 @@ impl Tracker {
             .history
             .frames
             .iter()
-            .map(|f| f.summary(f.anchor.and_then(|anchor| self.pose_by(&anchor))))
+            .map(|f| {
+                let refined = f.anchor.and_then(|anchor| self.pose_by(&anchor));
+                let summary = f.summary(refined);
+                // What was measured by keyframes of a submap that is not the map is in another frame.
+                let is_of_map = f.anchor.is_none() || refined.is_some();
+                FrameTrack {
+                    live: summary.live.filter(|_| is_of_map),
+                    ..summary
+                }
+            })
             .collect();
         self.history.into_tracks(tracks)
     }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use crate::mapper::keyframes::residency::Residency;
+use crate::mapper::keyframes::training_image::rescaled;
 use splat_geometry::answer::PoseQuality;
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::depth::DepthMap;
@@ -53,4 +54,16 @@ pub struct RegisteredKeyframe {
     /// Kept out of optimisation, measures quality.
     pub is_held_out: bool,
     pub home: Residency,
+}
+
+impl RegisteredKeyframe {
+    /// The world has another unit: lengths are so many times as long in it.
+    pub(crate) fn rescale(&mut self, factor: f64) {
+        self.depth = Arc::new(rescaled(&self.depth, factor));
+        self.median_depth = self.median_depth.map(|d| (f64::from(d) * factor) as f32);
+        if let Some(logs) = &mut self.depth_fit.log_metres {
+            *logs = logs.map(|log| log.map(|log| log - factor.ln()));
+        }
+        self.home.rescale(factor);
+    }
 }

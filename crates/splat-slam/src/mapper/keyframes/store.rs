@@ -132,13 +132,61 @@ impl KeyframeStore {
         self.waiting.remove(&id)
     }
 
-    /// All wait again; returns what they were registered as.
-    pub(crate) fn unregister_all(&mut self) -> BTreeMap<u32, RegisteredKeyframe> {
-        let registered = std::mem::take(&mut self.registered);
-        for (id, one) in &registered {
-            self.waiting.insert(*id, Arc::clone(&one.keyframe));
+    /// All that are registered leave, with what they say of the scene; those that wait stay.
+    pub(crate) fn take_registered(&mut self) -> Self {
+        let fresh = Self::default();
+        Self {
+            registered: std::mem::take(&mut self.registered),
+            scene_depth: std::mem::replace(&mut self.scene_depth, fresh.scene_depth),
+            pose_error: std::mem::replace(&mut self.pose_error, fresh.pose_error),
+            ..fresh
         }
-        registered
+    }
+
+    /// What is registered elsewhere comes in beside what is registered here.
+    pub(crate) fn absorb(&mut self, other: Self) {
+        let [rotation_rad, translation] = other.pose_error;
+        self.registered.extend(other.registered);
+        self.note_pose_error(rotation_rad, translation);
+        self.n_lost += other.n_lost;
+        self.measure_scene();
+    }
+
+    /// The world has another unit: lengths are so many times as long in it.
+    pub(crate) fn rescale(&mut self, factor: f64) {
+        self.scene_depth = (f64::from(self.scene_depth) * factor) as f32;
+        self.pose_error[1] = (f64::from(self.pose_error[1]) * factor) as f32;
+        self.registered
+            .values_mut()
+            .for_each(|registered| registered.rescale(factor));
+    }
+
+    /// Focal lengths are so many times as long.
+    pub(crate) fn refocus(&mut self, factor: f64) {
+        for registered in self.registered.values_mut() {
+            registered.intrinsics = registered.intrinsics.refocused(factor);
+        }
+    }
+
+    /// At most so many stay in memory, the newest; the others go to disk. Returns how many images were lost.
+    pub(crate) fn page_out_oldest(
+        &mut self,
+        most: usize,
+        engine: &mut dyn Engine,
+        paging: &mut Paging,
+        metres: Option<&ScaleParams>,
+    ) -> Result<u64, EngineError> {
+        let n_over = self.n_resident().saturating_sub(most);
+        let here = self.registered.iter().filter(|(_, p)| p.home.is_here);
+        let ids: Vec<u32> = here.map(|(id, _)| *id).take(n_over).collect();
+        for id in ids {
+            self.page_out(id, engine, paging, metres)?;
+        }
+        Ok(std::mem::take(&mut self.n_lost))
+    }
+
+    pub(crate) fn note_lost(&mut self, n_images: u64) {
+        self.n_lost += n_images;
     }
 
     pub(crate) fn scene_depth(&self) -> f32 {
@@ -328,7 +376,7 @@ impl KeyframeStore {
         };
         let size = (registered.image.width_px, registered.image.height_px);
         let (image, depth) = match view.unpacked(size) {
-            Ok((image, depth)) => (Arc::new(image), Arc::new(depth)),
+            Ok((image, depth)) => (Arc::new(image), registered.home.in_present_unit(depth)),
             Err(reason) => {
                 tracing::warn!("the image of keyframe {id} is lost: {reason}");
                 registered.home.copy = None;
@@ -362,6 +410,7 @@ impl KeyframeStore {
             self.n_lost += u64::from(page.is_none());
             if let Some(registered) = self.registered.get_mut(&id) {
                 registered.home.copy = page.map(|page| Content::OnDisk(Arc::from(page)));
+                registered.home.regrown = None;
             }
         }
         if let Some(registered) = self.registered.get_mut(&id) {
@@ -483,20 +532,4 @@ impl KeyframeStore {
         here.sort_unstable();
         here.into_iter().take(n).map(|(.., id)| id).collect()
     }
-}
-
-/// Images of all keyframes, wherever they are, for files.
-pub(crate) fn saved_views(registered: &BTreeMap<u32, RegisteredKeyframe>) -> Vec<SavedView> {
-    let view = |(id, registered): (&u32, &RegisteredKeyframe)| {
-        let in_memory = registered.home.is_here.then(|| Content::InMemory {
-            image: Arc::clone(&registered.image),
-            depth: Arc::clone(&registered.depth),
-        });
-        Some(SavedView {
-            keyframe_id: *id,
-            is_held_out: registered.is_held_out,
-            content: registered.home.copy.clone().or(in_memory)?,
-        })
-    };
-    registered.iter().filter_map(view).collect()
 }

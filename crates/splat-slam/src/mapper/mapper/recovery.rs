@@ -9,6 +9,8 @@ use crate::mapper::mapper::Mapper;
 use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
 use splat_engine::view::TrainingView;
+use splat_types::image::RgbImage;
+use splat_types::transform::Rigid;
 
 impl Mapper {
     /// Whether there is anything to go on from after a fault.
@@ -44,6 +46,7 @@ impl Mapper {
             self.engine.set_update_counts(0, &good.update_counts)?;
         }
         self.upload_views(&good.cameras)?;
+        self.upload_parked_views()?;
         self.trainer.note_trained(self.engine.poses()?.len());
         let (mut parts, trainer) = self.split();
         trainer.match_views(&mut parts)?;
@@ -79,6 +82,28 @@ impl Mapper {
                 depth: (depth.width_px > 0).then(|| Arc::clone(depth)),
                 mask: None,
             })?;
+        }
+        Ok(())
+    }
+
+    /// Views of parked submaps get an index, and no image before they are worked on again.
+    fn upload_parked_views(&mut self) -> Result<(), EngineError> {
+        for parked in self.submaps.parked_mut().iter_mut() {
+            let mut cam_from_maps = Vec::new();
+            for registered in parked.keyframes.values_mut() {
+                let cam_from_world = parked.cameras.cam_from_maps[registered.view_ix];
+                let (w, h) = (registered.image.width_px, registered.image.height_px);
+                registered.view_ix = self.engine.add_view(TrainingView {
+                    image: Arc::new(RgbImage::unloaded(w, h)),
+                    intrinsics: registered.intrinsics,
+                    cam_from_world,
+                    depth: None,
+                    mask: None,
+                })?;
+                cam_from_maps.resize(registered.view_ix + 1, Rigid::IDENTITY);
+                cam_from_maps[registered.view_ix] = cam_from_world;
+            }
+            parked.cameras.cam_from_maps = cam_from_maps;
         }
         Ok(())
     }

@@ -1,4 +1,6 @@
-//! What a map says of itself: its loss curve, its budgets, the quality of its poses, what it goes on from.
+//! What a map says of itself: its loss curve, its budgets, the quality of its poses, its submaps, what it goes on from.
+
+use std::sync::Arc;
 
 use crate::mapper::budgets::Budgets;
 use crate::mapper::keyframes::tracker_views::views_of;
@@ -6,10 +8,59 @@ use crate::mapper::mapper::Mapper;
 use crate::mapper::submaps::prior_map::ResumeReport;
 use crate::track::landmarks::KeyframeView;
 use splat_geometry::answer::PoseQuality;
-use splat_types::snapshot::KeyframePose;
+use splat_types::snapshot::{KeyframePose, Snapshot};
 use splat_types::time::Stamp;
 
+/// One submap in the last good state.
+#[derive(Debug, Clone)]
+pub struct SubmapReport {
+    /// The geometry's number.
+    pub id: u32,
+    pub n_keyframes: usize,
+    /// It is the map.
+    pub is_active: bool,
+    /// What it looks like in a frame of its own; `None` where it is the map, or has never been mapped.
+    pub parked: Option<Arc<Snapshot>>,
+}
+
 impl Mapper {
+    /// Keyframes per submap, as `submap_reports`.
+    pub fn submaps(&self) -> Vec<usize> {
+        let reports = self.submap_reports().into_iter();
+        reports.map(|submap| submap.n_keyframes).collect()
+    }
+
+    /// The map first, then those that have no known relation to it, in order of number.
+    pub fn submap_reports(&self) -> Vec<SubmapReport> {
+        let Some(good) = &self.last_good else {
+            return Vec::new();
+        };
+        let n_own = good.keyframes.registered().len();
+        let map = SubmapReport {
+            id: good.submaps.active().unwrap_or_default(),
+            n_keyframes: n_own,
+            is_active: true,
+            parked: None,
+        };
+        let parked = good.submaps.parked().iter().map(|parked| SubmapReport {
+            id: parked.submap,
+            n_keyframes: parked.n_keyframes(),
+            is_active: false,
+            parked: Some(Arc::clone(&parked.snapshot)),
+        });
+        let detached = good.submaps.detached_counts().into_iter();
+        let detached = detached.map(|(id, n_keyframes)| SubmapReport {
+            id,
+            n_keyframes,
+            is_active: false,
+            parked: None,
+        });
+        let mut others: Vec<SubmapReport> = parked.chain(detached).collect();
+        others.sort_by_key(|submap| submap.id);
+        let map = (n_own > 0).then_some(map);
+        map.into_iter().chain(others).collect()
+    }
+
     pub fn budgets(&self) -> Budgets {
         let registered = self.keyframes.registered().values();
         let counts = self.splats.counts();

@@ -182,14 +182,30 @@ impl Mapper {
         if n_over > 0 {
             self.evict_far((n_over, -1.0), &away)?;
         }
+        self.leave_out_surplus("the saved map")
+    }
+
+    /// What has no room in memory, and none on disk.
+    fn leave_out_surplus(&mut self, whose: &str) -> Result<(), EngineError> {
         let n_over = self.engine.len().saturating_sub(self.capacity());
         if n_over > 0 {
-            tracing::warn!("{n_over} splats of the saved map have no room and are left out");
+            tracing::warn!("{n_over} splats of {whose} have no room and are left out");
             let n = self.engine.len();
             let keep: Vec<bool> = (0..n).map(|ix| ix < n - n_over).collect();
             self.splats.retain(&keep, &mut *self.engine)?;
         }
         Ok(())
+    }
+
+    /// After splats came in beside those that were there.
+    pub(super) fn make_fit(&mut self, whose: &str) -> Result<(), EngineError> {
+        let n_over = self.engine.len().saturating_sub(self.capacity());
+        if n_over == 0 {
+            return Ok(());
+        }
+        let away = self.keyframes.distances(&mut *self.engine)?;
+        self.evict_far((n_over, -1.0), &away)?;
+        self.leave_out_surplus(whose)
     }
 
     /// What the budgets allow in all.

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 
 use crate::mapper::cameras::Cameras;
-use crate::mapper::keyframes::store::saved_views;
+use crate::mapper::keyframes::poses::keyframe_poses;
+use crate::mapper::keyframes::saved_views::saved_views;
 use crate::mapper::last_good::LastGood;
 use crate::mapper::map_file::checkpoint::Checkpoint;
 use crate::mapper::mapper::Mapper;
@@ -19,7 +20,7 @@ impl Mapper {
     pub fn snapshot(&mut self) -> Result<Arc<Snapshot>, EngineError> {
         let cameras = Cameras::read(&mut *self.engine)?;
         let read = self.splats.finite_copy(&mut *self.engine)?;
-        let poses = self.keyframe_poses(&cameras);
+        let poses = keyframe_poses(&self.keyframes, &cameras);
         let prior = self.submaps.prior().map(|prior| prior.scale);
         let first_id = self.first_id();
         let own = &poses[poses.partition_point(|pose| pose.keyframe_id < first_id)..];
@@ -64,7 +65,7 @@ impl Mapper {
     pub(super) fn keep_good(&mut self) -> Result<(), EngineError> {
         let cameras = Cameras::read(&mut *self.engine)?;
         let read = self.splats.finite_copy(&mut *self.engine)?;
-        let poses = self.keyframe_poses(&cameras);
+        let poses = keyframe_poses(&self.keyframes, &cameras);
         let revision = self.submaps.revision() + 1;
         let snapshot = self.snapshot_of(poses, revision, (read.splats, read.ids));
         self.keep(Arc::new(snapshot), cameras, read.update_counts);
@@ -82,20 +83,7 @@ impl Mapper {
         }));
     }
 
-    fn keyframe_poses(&self, cameras: &Cameras) -> Vec<KeyframePose> {
-        self.keyframes
-            .registered()
-            .values()
-            .map(|registered| KeyframePose {
-                keyframe_id: registered.keyframe.id,
-                stamp: registered.keyframe.frame.stamp,
-                world_from_cam: cameras.cam_from_maps[registered.view_ix].inverse(),
-                intrinsics: registered.intrinsics.refocused(cameras.focal_scale),
-            })
-            .collect()
-    }
-
-    fn snapshot_of(
+    pub(super) fn snapshot_of(
         &self,
         poses: Vec<KeyframePose>,
         revision: u32,

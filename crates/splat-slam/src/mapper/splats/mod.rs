@@ -11,3 +11,5 @@ pub mod regions;
 pub mod seeds;
 
 pub(crate) mod store;
+
+pub(crate) mod aside;

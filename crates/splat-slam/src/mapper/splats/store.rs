@@ -70,17 +70,19 @@ pub(crate) struct Balance {
 /// All splats of the map, wherever they are.
 #[derive(Debug, Default)]
 pub(crate) struct SplatSet {
-    ids: SplatIds,
-    on_disk: BTreeMap<u32, Evicted>,
+    pub(super) ids: SplatIds,
+    pub(super) on_disk: BTreeMap<u32, Evicted>,
     counts: SplatCounts,
     /// Share of the input that has come, while more is to come and where it is known.
     progress: Option<f64>,
     /// What a saved map brought: no share of the cap is kept from it.
     n_resumed: usize,
     /// All ids are new, and no client knows them.
-    is_renumbered: bool,
+    pub(super) is_renumbered: bool,
     /// Ids of splats at a depth that no view has verified; some may be gone.
-    guessed: BTreeSet<u32>,
+    pub(super) guessed: BTreeSet<u32>,
+    /// Part of the cap that parked submaps keep.
+    pub(super) n_parked: usize,
 }
 
 impl SplatSet {
@@ -256,7 +258,7 @@ impl SplatSet {
         keyframes: &KeyframeStore,
         engine: &dyn Engine,
     ) -> usize {
-        let by_number = params.map.max_splats;
+        let by_number = params.map.max_splats.saturating_sub(self.n_parked);
         if params.map.max_gpu_mib == 0 {
             return by_number;
         }
@@ -425,6 +427,7 @@ impl SplatSet {
                 sh_degree: region.sh_degree,
                 page: Arc::from(page),
                 world_from_anchor,
+                carried: None,
                 motion: None,
                 sample: sample.map(|m| DVec3::from(m.map(f64::from))).collect(),
             };

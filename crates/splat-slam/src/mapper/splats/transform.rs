@@ -51,8 +51,7 @@ pub(crate) fn transform_all(
     engine: &mut dyn Engine,
 ) -> Result<(), EngineError> {
     let mut splats = engine.read()?;
-    let carry = Carry::new(motion, splats.sh_degree);
-    (0..splats.len()).for_each(|i| carry.transform(&mut splats, i));
+    carry_all(motion, &mut splats);
     engine.replace(&splats)
 }
 
@@ -62,16 +61,27 @@ pub(crate) fn transform_seeded(
     engine: &mut dyn Engine,
 ) -> Result<(), EngineError> {
     let mut splats = engine.read()?;
+    carry_seeded(motions, &mut splats);
+    engine.replace(&splats)
+}
+
+/// The same of splats that are not in an engine.
+pub(crate) fn carry_seeded(motions: &BTreeMap<u32, Similarity>, splats: &mut Splats) {
     let carries: BTreeMap<u32, Carry> = motions
         .iter()
         .map(|(id, motion)| (*id, Carry::new(*motion, splats.sh_degree)))
         .collect();
     for i in 0..splats.len() {
         if let Some(carry) = carries.get(&splats.anchors[i]) {
-            carry.transform(&mut splats, i);
+            carry.transform(splats, i);
         }
     }
-    engine.replace(&splats)
+}
+
+/// Moves all of them.
+pub(crate) fn carry_all(motion: Similarity, splats: &mut Splats) {
+    let carry = Carry::new(motion, splats.sh_degree);
+    (0..splats.len()).for_each(|i| carry.transform(splats, i));
 }
 
 #[cfg(test)]

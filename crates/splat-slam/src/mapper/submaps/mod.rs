@@ -6,6 +6,14 @@ mod prior_alignment;
 
 pub mod prior_map;
 
+pub(crate) mod pose_revision;
+
+pub(crate) mod parked;
+
+pub(crate) mod parked_submaps;
+
 pub(crate) mod registry;
+
+pub(crate) mod active;
 
 pub(crate) mod pose_updates;

@@ -7,9 +7,9 @@ use glam::DVec3;
 
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
-use crate::mapper::keyframes::training_image::rescaled;
-use crate::mapper::splats::store::SplatSet;
 use crate::mapper::splats::transform::transform_seeded;
+use crate::mapper::submaps::parked::Parked;
+use crate::mapper::submaps::pose_revision::revise;
 use crate::mapper::submaps::registry::Submaps;
 use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
@@ -18,21 +18,18 @@ use splat_geometry::similarity;
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::transform::{Rigid, Similarity};
 
-/// A submap of at least this many keyframes, and this many times as large as the map's, takes the map's place.
-const MIN_TAKEOVER: usize = 8;
-const TAKEOVER_RATIO: usize = 2;
-/// A revision that moves a camera by less, as a share of the scene's depth or in radians, is left to the optimiser.
-const MIN_REVISION: f64 = 5e-4;
-/// One that moves any by more than this is a correction of the map: clients drop what they have.
+/// A revision that moves any by more than this is a correction of the map: clients drop what they have.
 const CORRECTION: f64 = 0.02;
 
 /// How the splats of each keyframe move, and where its camera was.
 type Motions = BTreeMap<u32, (Similarity, DVec3)>;
 
-/// What follows from updates: views of submaps that joined, and whether splats moved.
+/// What follows from updates: views of submaps that joined, one that was parked and joined, in the map's world, and whether
+/// splats moved.
 #[derive(Debug, Default)]
 pub(crate) struct MapUpdate {
     pub(crate) joined: Vec<View>,
+    pub(crate) unparked: Option<Parked>,
     pub(crate) has_moved: bool,
 }
 
@@ -51,7 +48,7 @@ impl Submaps {
         let old_unit = keyframes.world_from_submap(&map_poses).scale;
         let world_from_submap = self.follow(&geometry.revised, &map_poses, keyframes);
         let unit = world_from_submap.scale / old_unit;
-        let (mut motions, mut joined) = (Motions::new(), Vec::new());
+        let mut motions = Motions::new();
         for revision in &geometry.revised {
             let id = revision.keyframe_id;
             if let Some(view) = self.detached.get_mut(&id) {
@@ -62,13 +59,8 @@ impl Submaps {
                 view.depth.scale(revision.depth_factor);
             } else if let Some(registered) = keyframes.registered().get(&id) {
                 let old = map_poses[registered.view_ix].inverse();
-                let motion = update_registered(
-                    revision,
-                    &old,
-                    (&world_from_submap, unit),
-                    keyframes,
-                    engine,
-                )?;
+                let frame = (&world_from_submap, unit);
+                let motion = update_registered(revision, &old, frame, keyframes, engine)?;
                 motions.extend(motion.map(|motion| (id, (motion, old.translation))));
             }
         }
@@ -76,22 +68,20 @@ impl Submaps {
             let motions = motions.iter().map(|(id, (motion, _))| (*id, *motion));
             transform_seeded(&motions.collect(), engine)?;
         }
-        let own = self.active;
-        let ids = self.detached.iter();
-        let ids: Vec<u32> = ids
-            .filter(|(_, view)| Some(view.submap) == own)
-            .map(|(id, _)| *id)
-            .collect();
-        joined.extend(
-            ids.iter()
-                .filter_map(|id| self.detached.remove(id))
-                .map(Arc::unwrap_or_clone),
-        );
-        let is_merge = !joined.is_empty();
+        self.parked.apply_updates(&geometry.revised);
+        let unparked = self.take_parked().map(|mut parked| {
+            parked.carry(&(world_from_submap * parked.world_from_submap().inverse()));
+            parked
+        });
+        let joined = self.take_detached();
+        // So much that is new goes out as a whole.
+        self.epoch += u32::from(unparked.is_some());
+        let is_merge = !joined.is_empty() || unparked.is_some();
         self.report_motions(&motions, &map_poses, is_merge, keyframes);
         Ok(MapUpdate {
-            has_moved: !motions.is_empty(),
+            has_moved: !motions.is_empty() || unparked.is_some(),
             joined,
+            unparked,
         })
     }
 
@@ -163,91 +153,32 @@ impl Submaps {
         }
         self.report_correction(correction);
     }
-
-    /// When another submap has grown far beyond the map's, the map starts again from it: its views.
-    pub(crate) fn restart_from(
-        &mut self,
-        keyframes: &mut KeyframeStore,
-        splats: &mut SplatSet,
-        engine: &mut dyn Engine,
-    ) -> Result<Option<Vec<View>>, EngineError> {
-        let own = keyframes.registered().len();
-        let largest = self.detached_counts().into_iter().max_by_key(|(_, n)| *n);
-        let Some((submap, n)) =
-            largest.filter(|(_, n)| *n >= MIN_TAKEOVER && *n >= TAKEOVER_RATIO * own.max(1))
-        else {
-            return Ok(None);
-        };
-        tracing::warn!("submap {submap} with {n} keyframes takes the place of the map of {own}");
-        splats.retain(&vec![false; engine.len()], engine)?;
-        let old_submap = self.active.unwrap_or_default();
-        for (id, registered) in keyframes.unregister_all() {
-            let view = View {
-                keyframe_id: id,
-                submap: old_submap,
-                intrinsics: registered.intrinsics,
-                lens: registered.lens,
-                submap_from_cam: registered.submap_from_cam,
-                depth: (*registered.depth).clone(),
-                health: registered.health,
-            };
-            self.detached.insert(id, Arc::new(view));
-        }
-        self.anchor.clear();
-        self.active = Some(submap);
-        self.epoch += 1;
-        self.report_correction(MapCorrection::identity(Reason::Reset));
-        let ids: Vec<u32> = self
-            .detached
-            .values()
-            .filter(|v| v.submap == submap)
-            .map(|v| v.keyframe_id)
-            .collect();
-        let taken = ids.into_iter().filter_map(|id| self.detached.remove(&id));
-        Ok(Some(taken.map(Arc::unwrap_or_clone).collect()))
-    }
 }
 
 /// Moves one camera; what its splats move by, unless that is next to nothing.
 fn update_registered(
-    revision: &PoseUpdate,
+    update: &PoseUpdate,
     old: &Rigid,
-    (world_from_submap, unit): (&Similarity, f64),
+    frame: (&Similarity, f64),
     keyframes: &mut KeyframeStore,
     engine: &mut dyn Engine,
 ) -> Result<Option<Similarity>, EngineError> {
-    let scene_depth = keyframes.scene_depth();
-    let Some(registered) = keyframes.get_mut(revision.keyframe_id) else {
+    let Some(revision) = revise(update, old, frame, keyframes) else {
         return Ok(None);
     };
-    let image = &registered.image;
-    let intrinsics = revision.intrinsics.resized(image.width_px, image.height_px);
-    if intrinsics != registered.intrinsics {
-        registered.intrinsics = intrinsics;
-        engine.set_intrinsics(registered.view_ix, &intrinsics)?;
-    }
-    let model_motion = revision.submap_from_cam * registered.submap_from_cam.inverse();
-    registered.submap_from_cam = revision.submap_from_cam;
-    let new = world_from_submap.transform_pose(&revision.submap_from_cam);
-    let moved = (new.translation - old.translation).length() / f64::from(scene_depth);
-    let scale = revision.depth_factor * unit;
-    let turned = model_motion.angle_to(&Rigid::IDENTITY);
-    if turned.max(moved).max(scale.ln().abs()) <= MIN_REVISION {
+    let Some(registered) = keyframes.registered().get(&update.keyframe_id) else {
         return Ok(None);
-    }
-    if (scale - 1.0).abs() > f64::EPSILON {
-        let depth = Arc::new(rescaled(&registered.depth, scale));
-        registered.median_depth = depth.median();
-        registered.depth_fit.log_metres = None;
-        registered.depth = Arc::clone(&depth);
-        if depth.width_px > 0 {
-            engine.set_depth(registered.view_ix, Some(depth))?;
-        }
-    }
-    engine.set_pose(registered.view_ix, new.inverse())?;
-    let resized = Similarity {
-        scale,
-        ..Similarity::IDENTITY
     };
-    Ok(Some(Similarity::from(new) * resized * old.inverse().into()))
+    let view_ix = registered.view_ix;
+    if revision.has_new_intrinsics {
+        engine.set_intrinsics(view_ix, &registered.intrinsics)?;
+    }
+    let Some(motion) = revision.motion else {
+        return Ok(None);
+    };
+    if motion.has_new_depth {
+        engine.set_depth(view_ix, Some(Arc::clone(&registered.depth)))?;
+    }
+    engine.set_pose(view_ix, motion.world_from_cam.inverse())?;
+    Ok(Some(motion.of_splats))
 }

@@ -4,19 +4,24 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::mapper::keyframes::store::KeyframeStore;
+use crate::mapper::submaps::parked_submaps::ParkedSubmaps;
 use crate::mapper::submaps::pose_anchor::PoseAnchor;
 use crate::mapper::submaps::prior_map::{PriorMap, ResumeReport};
 use splat_geometry::answer::View;
 use splat_types::correction::MapCorrection;
 use splat_types::transform::{Rigid, Similarity};
 
-/// Frames of the geometry, and their relation to the world frame.
+/// Frames of the geometry, and their relation to the world frame. Many methods: which submap is the map, what moved it and what
+/// waits beside it belong together, and each step of a batch asks for another part of it.
 #[derive(Debug, Default)]
 pub(crate) struct Submaps {
     /// The model's submap that the map is made of.
     pub(super) active: Option<u32>,
-    /// Views that the model registered in a submap that has no known relation to the map.
+    /// Views that the model registered in a submap that has no known relation to the map; of keyframes of a parked submap
+    /// what the model has said of them since.
     pub(super) detached: BTreeMap<u32, Arc<View>>,
+    /// Submaps that were the map before and have no known relation to the one that is.
+    pub(super) parked: ParkedSubmaps,
     pub(super) anchor: PoseAnchor,
     /// The map that this one goes on from.
     pub(super) prior: Option<PriorMap>,
@@ -31,8 +36,24 @@ pub(crate) struct Submaps {
 pub(crate) struct SubmapState {
     active: Option<u32>,
     detached: BTreeMap<u32, Arc<View>>,
+    parked: ParkedSubmaps,
     correction: Option<MapCorrection>,
     is_joined: bool,
+}
+
+impl SubmapState {
+    pub(crate) fn active(&self) -> Option<u32> {
+        self.active
+    }
+
+    pub(crate) fn parked(&self) -> &ParkedSubmaps {
+        &self.parked
+    }
+
+    /// Number of keyframes per submap that has never been the map.
+    pub(crate) fn detached_counts(&self) -> BTreeMap<u32, usize> {
+        counts(&self.detached, &self.parked)
+    }
 }
 
 impl Submaps {
@@ -102,7 +123,9 @@ impl Submaps {
             if view.submap == submap {
                 self.detached.remove(&view.keyframe_id);
                 own.push(view.clone());
-            } else if keyframes.is_waiting(view.keyframe_id) {
+            } else if keyframes.is_waiting(view.keyframe_id)
+                || self.parked.has_keyframe(view.keyframe_id)
+            {
                 let view = Arc::new(view.clone());
                 self.detached.insert(view.keyframe_id, view);
             }
@@ -117,13 +140,9 @@ impl Submaps {
         }
     }
 
-    /// Number of keyframes per submap other than the map's own.
+    /// Number of keyframes per submap that has never been the map.
     pub(crate) fn detached_counts(&self) -> BTreeMap<u32, usize> {
-        let mut counts = BTreeMap::new();
-        for view in self.detached.values() {
-            *counts.entry(view.submap).or_insert(0) += 1;
-        }
-        counts
+        counts(&self.detached, &self.parked)
     }
 
     /// From now on the map is made of that submap: saved keyframes stand in its frame. Returns its views.
@@ -140,10 +159,16 @@ impl Submaps {
             registered.submap_from_cam = submap_from_world.transform_pose(&world_from_cam);
         }
         self.active = Some(submap);
+        self.take_detached()
+    }
+
+    /// Views of the map's own submap that were kept apart.
+    pub(super) fn take_detached(&mut self) -> Vec<View> {
+        let own = self.active;
         let detached = std::mem::take(&mut self.detached);
         let (own, rest): (BTreeMap<u32, Arc<View>>, BTreeMap<u32, Arc<View>>) = detached
             .into_iter()
-            .partition(|(_, view)| view.submap == submap);
+            .partition(|(_, view)| Some(view.submap) == own);
         self.detached = rest;
         own.into_values().map(Arc::unwrap_or_clone).collect()
     }
@@ -169,6 +194,7 @@ impl Submaps {
         SubmapState {
             active: self.active,
             detached: self.detached.clone(),
+            parked: self.parked.clone(),
             correction: self.correction,
             is_joined: self.prior.as_ref().is_some_and(|prior| prior.is_joined),
         }
@@ -178,6 +204,7 @@ impl Submaps {
     pub(crate) fn restore(&mut self, state: &SubmapState) {
         self.active = state.active;
         self.detached.clone_from(&state.detached);
+        self.parked = state.parked.clone();
         self.correction = state.correction;
         if let Some(prior) = &mut self.prior {
             prior.is_joined = state.is_joined;
@@ -188,5 +215,15 @@ impl Submaps {
     pub(crate) fn forget_all(&mut self) {
         self.active = None;
         self.detached.clear();
+        self.parked.clear();
     }
+}
+
+fn counts(detached: &BTreeMap<u32, Arc<View>>, parked: &ParkedSubmaps) -> BTreeMap<u32, usize> {
+    let mut counts = BTreeMap::new();
+    let never_mapped = detached.iter().filter(|(id, _)| !parked.has_keyframe(**id));
+    for (_, view) in never_mapped {
+        *counts.entry(view.submap).or_insert(0) += 1;
+    }
+    counts
 }
