@@ -22,6 +22,9 @@ pub struct Report {
     pub version: String,
     pub frames: FrameCounts,
     pub keyframes: KeyframeCounts,
+    /// The map first, then those that have no known relation to it.
+    #[serde(default)]
+    pub submaps: Vec<SubmapEntry>,
     pub splats: u64,
     pub steps: u64,
     pub adapter: String,
@@ -79,9 +82,22 @@ pub struct KeyframeCounts {
     /// Of the map that the run went on from; not among the others.
     #[serde(default)]
     pub before: u64,
-    /// Groups of keyframes whose relation to each other is unknown; the map is the largest.
+    /// Groups of keyframes whose relation to each other is unknown; the map is the largest that was mapped.
     #[serde(rename = "components")]
     pub submaps: u64,
+}
+
+/// Keyframes with one frame and unit, and what was made of them.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SubmapEntry {
+    /// The geometry's number.
+    pub id: u64,
+    pub keyframes: u64,
+    pub splats: u64,
+    /// In the run directory; null where it has no splats.
+    pub file: Option<String>,
+    /// It is the map, in whose frame all other files are.
+    pub active: bool,
 }
 
 /// Seconds of work by stage; stages overlap, so they need not add up to `wall`.

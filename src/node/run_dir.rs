@@ -18,8 +18,8 @@ use crate::eval::frames::{self, FrameRow, Source as Known};
 use crate::eval::image_metrics;
 use crate::eval::lpips::{Lpips, LpipsError};
 use crate::eval::report_json::{
-    FrameCounts, KeyframeCounts, Latency, LoadShedding, Quality, Report, Resumed, Timing,
-    TrackingFigures, percentile,
+    FrameCounts, KeyframeCounts, Latency, LoadShedding, Quality, Report, Resumed, SubmapEntry,
+    Timing, TrackingFigures, percentile,
 };
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::machine::memory::peak_rss_mib;
@@ -31,6 +31,7 @@ use crate::report::comparisons::Comparison;
 use crate::report::html::{ReportInputs, write_html};
 use crate::report::pose_quality::write_health;
 use splat_engine::error::EngineError;
+use splat_slam::mapper::mapper::reports::SubmapReport;
 use splat_types::image::RgbImage;
 use splat_types::rendering::Rendering;
 use splat_types::splats::layout::map_sha256;
@@ -150,7 +151,47 @@ fn write_map(
         write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
         frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
     ];
-    results.into_iter().collect()
+    let written: anyhow::Result<()> = results.into_iter().collect();
+    let submaps = write_submaps(outcome, out);
+    written.and(submaps)
+}
+
+/// Splats of submaps that are not the map, each in a frame of its own.
+fn write_submaps(outcome: &Outcome, out: &Path) -> anyhow::Result<()> {
+    let reports = outcome.map.submap_reports().into_iter();
+    let parked = reports.filter_map(|submap| Some((submap.id, submap.parked?)));
+    parked
+        .filter(|(_, parked)| !parked.splats.is_empty())
+        .try_for_each(|(id, parked)| save(MapFile::Ply(&parked.splats), &out.join(submap_file(id))))
+}
+
+fn submap_file(id: u32) -> String {
+    format!("submap_{id}.ply")
+}
+
+fn submap_entries(outcome: &Outcome) -> Vec<SubmapEntry> {
+    let entry = |submap: SubmapReport| {
+        let parked = submap.parked.map_or(0, |parked| parked.splats.len());
+        let (n_splats, file) = if submap.is_active {
+            let n_splats = outcome.snapshot.splats.len();
+            (n_splats, "map.ply".to_owned())
+        } else {
+            (parked, submap_file(submap.id))
+        };
+        SubmapEntry {
+            id: u64::from(submap.id),
+            keyframes: submap.n_keyframes as u64,
+            splats: n_splats as u64,
+            file: (n_splats > 0).then_some(file),
+            active: submap.is_active,
+        }
+    };
+    outcome
+        .map
+        .submap_reports()
+        .into_iter()
+        .map(entry)
+        .collect()
 }
 
 fn write_report(
@@ -210,6 +251,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             before: outcome.map.continuation().map_or(0, |c| c.keyframes as u64),
             submaps: outcome.map.submaps().len() as u64,
         },
+        submaps: submap_entries(outcome),
         splats: snapshot.splats.len() as u64,
         steps,
         adapter: outcome.map.adapter(),

@@ -104,12 +104,28 @@ fn notices(report: &Report, evaluation: Option<&Evaluation>) -> Markup {
         @if missing > 0 { p.notice.warn { (count(missing)) " of " (count(report.keyframes.selected)) " keyframes have no pose." } }
         @if let Some(note) = &report.geometry_note { p.notice.warn { "Geometry: " (note) } }
         @if report.keyframes.submaps > 1 {
-            p.notice.warn { "The keyframes fell into " (report.keyframes.submaps) " groups without a known relation; the map is the largest." }
+            p.notice.warn { "The keyframes fell into " (report.keyframes.submaps) " groups without a known relation; the map is the largest that was mapped." (other_submaps(report)) }
         }
         @for (n, what) in lost {
             @if n > 0 { p.notice.warn { (count(n)) " of " (count(report.frames.received)) " frames " (what) "." } }
         }
         @if let Some(note) = evaluation.and_then(|evaluation| evaluation.note.as_ref()) { p.notice.warn { "Reference: " (note) "." } }
+    }
+}
+
+/// What became of the groups that are not the map.
+fn other_submaps(report: &Report) -> String {
+    let others = report.submaps.iter().filter(|submap| !submap.active);
+    let files = others.filter_map(|submap| {
+        let (file, n) = (submap.file.as_ref()?, count(submap.splats));
+        Some(format!(
+            "{file} ({} keyframes, {n} splats)",
+            count(submap.keyframes)
+        ))
+    });
+    match files.collect::<Vec<_>>().join(", ") {
+        files if files.is_empty() => String::new(),
+        files => format!(" Others are mapped, each in a frame of its own: {files}."),
     }
 }
 

@@ -69,6 +69,7 @@ mod sizes;
 mod slam;
 mod source_errors;
 mod sources;
+mod submap_runs;
 mod submaps;
 mod synthetic;
 mod synthetic_source;

@@ -73,6 +73,7 @@ source_fault
 splats
 steps
 steps_per_s
+submaps
 timing_s.decode
 timing_s.geometry
 timing_s.optimise
@@ -107,6 +108,7 @@ pub(crate) fn sample_report() -> Report {
             before: 40,
             submaps: 1,
         },
+        submaps: Vec::new(),
         splats: 58_312,
         steps: 1200,
         adapter: "cpu (2 threads, avx2)".to_owned(),

@@ -10,7 +10,7 @@ use splat_types::transform::{Rigid, Similarity};
 /// A revision that moves a camera by less, as a share of the scene's depth or in radians, is left to the optimiser.
 const MIN_REVISION: f64 = 5e-4;
 
-/// What a revision has changed; the engine has still to be told.
+/// What a revision has changed; the engine does not have it yet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Revision {
     pub(crate) has_new_intrinsics: bool,
