@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::node::autosave::Autosave;
 use crate::node::backpressure::Backpressure;
 use crate::node::job::{Activity, KeyframeLatency, Progress};
+use crate::node::publish_threads::Outgoing;
 use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
 use crate::node::requests::RequestHandler;
@@ -43,7 +44,7 @@ const SECS_AFTER_STOP: f64 = 0.7;
 const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 
 /// Takes a snapshot for everybody, or only word of how far the run is.
-pub(crate) type Publish<'a> = dyn FnMut(Option<Arc<Snapshot>>, Progress) + 'a;
+pub(crate) type Publish<'a> = dyn FnMut(Option<Outgoing>, Progress) + 'a;
 
 /// Frames -> batches.
 #[derive(Debug)]
@@ -459,7 +460,13 @@ impl MapStage {
     /// The status counts the splats of what goes out: fewer than the engine's where some are not finite.
     fn hand_over(&self, snapshot: Arc<Snapshot>, progress: Progress, publish: &mut Publish<'_>) {
         self.report(|status| status.n_splats = snapshot.splats.len() as u64);
-        publish(Some(snapshot), progress);
+        let submaps = self.map.submap_reports().into_iter();
+        let submaps = submaps.filter_map(|submap| submap.parked);
+        let outgoing = Outgoing {
+            snapshot,
+            submaps: submaps.filter(|parked| !parked.splats.is_empty()).collect(),
+        };
+        publish(Some(outgoing), progress);
     }
 
     /// `None` once mapping has ended.

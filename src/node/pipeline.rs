@@ -8,7 +8,7 @@ use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, Publish, SelectStage};
 use crate::node::publish_threads::{
-    LiveStage, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
+    LiveStage, Outgoing, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
 };
 use crate::node::source_thread::SourceStage;
 use crate::node::threads::{Answer, Niceness, joined, own_pool, run_select, run_source};
@@ -148,9 +148,9 @@ impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
         let (mut live, mut snapshots) = (self.live, self.snapshots);
-        let mut publish = |snapshot: Option<Arc<Snapshot>>, progress: Progress| {
-            if let Some((stage, snapshot)) = snapshots.as_mut().zip(snapshot) {
-                stage.publish(&(snapshot, progress.has_ended), 0);
+        let mut publish = |outgoing: Option<Outgoing>, progress: Progress| {
+            if let Some((stage, outgoing)) = snapshots.as_mut().zip(outgoing) {
+                stage.publish(&(outgoing, progress.has_ended), 0);
             }
             on_progress(progress);
         };
@@ -254,11 +254,11 @@ impl Stages {
             run_geometry(self.geometry, &batches, &answers_tx, limit)
         })?;
         let map = spawn("map", move || {
-            let mut publish = |snapshot: Option<Arc<Snapshot>>, progress: Progress| {
+            let mut publish = |outgoing: Option<Outgoing>, progress: Progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
                 let is_last = progress.has_ended;
-                if let Some(snapshot) = snapshot {
-                    drop(snapshots_tx.send((snapshot, is_last)));
+                if let Some(outgoing) = outgoing {
+                    drop(snapshots_tx.send((outgoing, is_last)));
                 }
                 progress_tx.send(progress).ok();
             };

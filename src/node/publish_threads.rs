@@ -29,8 +29,15 @@ pub(crate) enum LiveEvent {
     Keyframe(Box<KeyframeDepth>),
 }
 
-/// A snapshot, and whether it is the last one.
-pub(crate) type SnapshotEvent = (Arc<Snapshot>, bool);
+/// The map as it is to go out, with all submaps that have no known relation to it.
+#[derive(Debug, Clone)]
+pub(crate) struct Outgoing {
+    pub(crate) snapshot: Arc<Snapshot>,
+    pub(crate) submaps: Vec<Arc<Snapshot>>,
+}
+
+/// What goes out, and whether it is the last.
+pub(crate) type SnapshotEvent = (Outgoing, bool);
 
 /// Logs failures to send, at most once per `LOG_SECS`.
 #[derive(Debug, Default)]
@@ -96,10 +103,11 @@ pub(crate) struct SnapshotStage {
 
 impl SnapshotStage {
     /// `n_queued` snapshots wait behind it.
-    pub(crate) fn publish(&mut self, (snapshot, is_last): &SnapshotEvent, n_queued: usize) {
+    pub(crate) fn publish(&mut self, (outgoing, is_last): &SnapshotEvent, n_queued: usize) {
         let map = &mut self.map;
-        let sent = map.publish(&self.publisher, snapshot, *is_last, n_queued);
-        self.rate_limited.of(sent);
+        let sent = map.publish(&self.publisher, &outgoing.snapshot, *is_last, n_queued);
+        let submaps = map.publish_submaps(&self.publisher, &outgoing.submaps);
+        self.rate_limited.of(sent.and(submaps));
     }
 }
 

@@ -59,6 +59,7 @@ mod scene_formats;
 mod scene_reference;
 mod scenes;
 mod sent_corrections;
+mod sent_submaps;
 mod sfm;
 mod sfm_batches;
 mod sfm_lenses;

@@ -15,7 +15,7 @@ use splat_types::correction::{MapCorrection, Reason};
 use splat_types::snapshot::Snapshot;
 use splat_types::transform::Similarity;
 
-type Sent = Arc<Mutex<Vec<(&'static str, Vec<u8>)>>>;
+pub(crate) type Sent = Arc<Mutex<Vec<(&'static str, Vec<u8>)>>>;
 
 /// Keeps what it is given.
 struct Kept(Sent);
@@ -32,7 +32,7 @@ impl Transport for Kept {
     }
 }
 
-fn output() -> (Output, Sent) {
+pub(crate) fn output() -> (Output, Sent) {
     let sent = Sent::default();
     let kept = Kept(Arc::clone(&sent));
     let output = Output::open(&params(&[]).publish, Some(Box::new(kept)));

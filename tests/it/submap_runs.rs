@@ -1,12 +1,14 @@
 //! Whole replays in which tracking is lost between two places: what becomes of the submaps, in the run directory.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use rayon::prelude::*;
 use serde_json::Value;
 
 use splat_mapper::eval::trajectory::read_tum;
+use splat_msgs::map_messages::SplatManifest;
+use splat_msgs::ros;
 use splat_slam::mapper::map_file::checkpoint;
 use splat_synth::settings::SynthSettings;
 use splat_synth::take::Take;
@@ -46,8 +48,26 @@ fn replay(images: &Path, out: &Path, steps: &str) -> Output {
         .args(["--set", "select.every_frame=true"])
         .args(["--set", "sfm.max_features=800"])
         .args(["--set", "train.seeds_per_keyframe=600"])
+        .args(["--set", "map.snapshot_secs=0.05", "--set"])
+        .arg(format!("publish.record={}", sent(out).display()))
         .output()
         .unwrap()
+}
+
+/// All that was published, beside the run directory.
+fn sent(out: &Path) -> PathBuf {
+    out.with_extension("mcap")
+}
+
+/// Splats of each manifest of a submap that was published.
+fn published_splats(out: &Path) -> Vec<u32> {
+    let bytes = std::fs::read(sent(out)).unwrap();
+    let messages = mcap::MessageStream::new(&bytes)
+        .unwrap()
+        .map(Result::unwrap);
+    let manifests = messages.filter(|m| m.channel.topic == "/splat_mapper/submaps/manifest");
+    let manifest = |m: mcap::Message<'_>| ros::decode::<SplatManifest>(&m.data).unwrap();
+    manifests.map(|m| manifest(m).n_splats).collect()
 }
 
 fn report(out: &Path) -> Value {
@@ -99,6 +119,12 @@ fn two_places_without_a_way_between_are_two_maps_in_the_run_directory() {
     let splats = ply::read(&out.join(&file)).unwrap();
     assert_eq!(splats.len() as u64, other["splats"].as_u64().unwrap());
     assert!(splats.len() > 1000, "{}", splats.len());
+    let published = published_splats(&out);
+    assert_eq!(
+        published.last(),
+        Some(&(splats.len() as u32)),
+        "{published:?}"
+    );
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.contains(&file) && page.contains("in a frame of its own"));
     // Poses in another frame are in no trajectory: no frame of the second place has one.
@@ -133,6 +159,10 @@ fn a_loop_joins_two_places_and_one_map_has_the_splats_of_both() {
     let submaps = report["submaps"].as_array().unwrap();
     assert_eq!(submaps.len(), 1, "{submaps:?}");
     assert!(submap_files(&out).is_empty());
+    // Published while it was parked, and taken back since.
+    let published = published_splats(&out);
+    assert!(published.first().is_some_and(|n| *n > 500), "{published:?}");
+    assert_eq!(published.last(), Some(&0), "{published:?}");
     let poses = read_tum(&out.join("keyframes.tum")).unwrap();
     assert!(poses.len() >= 80, "{}", poses.len());
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();

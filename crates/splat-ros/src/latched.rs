@@ -15,7 +15,24 @@ pub static KEYFRAMES: Topic =
 pub static SPLATS: Topic = Topic::of::<SplatChunk>("splats", Delivery::Reliable { depth: 1000 });
 pub static MANIFEST: Topic =
     Topic::of::<SplatManifest>("splats/manifest", Delivery::Latched { depth: 1 });
-pub static TOPICS: [&Topic; 3] = [&KEYFRAMES, &MANIFEST, &SPLATS];
+/// The same of submaps that have no known relation to the map. Few and seldom sent, so that middleware may keep them.
+pub static SUBMAP_KEYFRAMES: Topic =
+    Topic::of::<KeyframeArray>("submaps/keyframes", Delivery::Latched { depth: 64 });
+pub static SUBMAP_SPLATS: Topic =
+    Topic::of::<SplatChunk>("submaps/splats", Delivery::Latched { depth: 256 });
+pub static SUBMAP_MANIFEST: Topic =
+    Topic::of::<SplatManifest>("submaps/manifest", Delivery::Latched { depth: 64 });
+pub static TOPICS: [&Topic; 6] = [
+    &KEYFRAMES,
+    &MANIFEST,
+    &SPLATS,
+    &SUBMAP_KEYFRAMES,
+    &SUBMAP_MANIFEST,
+    &SUBMAP_SPLATS,
+];
+
+/// Bytes of a map's id that the frame of a submap is named after.
+const N_NAMED_BYTES: usize = 4;
 
 /// The published map, with the digest of its splats: that takes a pass over all of them.
 #[derive(Debug, Clone)]
@@ -24,11 +41,25 @@ pub struct PublishedMap {
     map_sha256: [u8; 32],
 }
 
+/// A submap beside the map, in a frame of its own.
+#[derive(Debug, Clone)]
+pub struct PublishedSubmap {
+    map: PublishedMap,
+    frame: String,
+}
+
+impl PublishedSubmap {
+    pub fn snapshot(&self) -> &Snapshot {
+        &self.map.snapshot
+    }
+}
+
 #[derive(Debug, Default)]
 struct LatchedSample {
     /// By topic, unless they are pieces of the map.
     newest: BTreeMap<&'static str, Sample>,
     map: Option<PublishedMap>,
+    submaps: Vec<PublishedSubmap>,
 }
 
 /// Shared by all transports and services.
@@ -65,6 +96,29 @@ impl LatchedStore {
         map
     }
 
+    pub(crate) fn keep_submaps(&self, submaps: Vec<PublishedSubmap>) {
+        self.kept().submaps = submaps;
+    }
+
+    /// Its frame is named after its map's id: no transform leads there.
+    pub(crate) fn submap(&self, snapshot: &Arc<Snapshot>) -> PublishedSubmap {
+        let id = &snapshot.map_id[..N_NAMED_BYTES];
+        let id: String = id.iter().map(|byte| format!("{byte:02x}")).collect();
+        PublishedSubmap {
+            map: PublishedMap {
+                snapshot: Arc::clone(snapshot),
+                map_sha256: layout::digest(&snapshot.splats),
+            },
+            frame: format!("{}_{id}", self.splat_frame),
+        }
+    }
+
+    /// A submap cut into messages.
+    pub(crate) fn submap_messages<'a>(&self, submap: &'a PublishedSubmap) -> Messages<'a> {
+        let PublishedSubmap { map, frame } = submap;
+        Messages::of_known(&map.snapshot, map.map_sha256, frame, self.chunk_bytes)
+    }
+
     pub fn map(&self) -> Option<PublishedMap> {
         self.kept().map.clone()
     }
@@ -85,6 +139,18 @@ impl LatchedStore {
         topic: &Topic,
         send: &mut dyn FnMut(&Sample) -> Result<(), PublishError>,
     ) -> Result<(), PublishError> {
+        if [&SUBMAP_KEYFRAMES, &SUBMAP_SPLATS, &SUBMAP_MANIFEST]
+            .iter()
+            .any(|of_submaps| of_submaps.name == topic.name)
+        {
+            let submaps = self.kept().submaps.clone();
+            return submaps.iter().try_for_each(|submap| {
+                send_submap(&self.submap_messages(submap), &mut |post| {
+                    let is_asked = post.topic.name == topic.name;
+                    if is_asked { send(post) } else { Ok(()) }
+                })
+            });
+        }
         let is_of_map = [&KEYFRAMES, &SPLATS, &MANIFEST]
             .iter()
             .any(|of_map| of_map.name == topic.name);
@@ -109,4 +175,20 @@ impl LatchedStore {
         }
         Ok(())
     }
+}
+
+/// All messages of a submap.
+pub(crate) fn send_submap(
+    messages: &Messages<'_>,
+    send: &mut dyn FnMut(&Sample) -> Result<(), PublishError>,
+) -> Result<(), PublishError> {
+    let stamp = messages.snapshot.stamp;
+    send(&Sample::of(&SUBMAP_MANIFEST, stamp, &messages.manifest())?)?;
+    for array in messages.keyframes() {
+        send(&Sample::of(&SUBMAP_KEYFRAMES, stamp, &array)?)?;
+    }
+    for chunk in messages.chunks() {
+        send(&Sample::of(&SUBMAP_SPLATS, stamp, &chunk)?)?;
+    }
+    Ok(())
 }

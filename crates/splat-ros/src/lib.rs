@@ -31,6 +31,8 @@ pub mod publisher;
 
 pub mod reports;
 
+pub mod submap_stream;
+
 pub mod map_stream;
 
 pub mod pose_stream;

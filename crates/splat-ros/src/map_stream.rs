@@ -13,6 +13,7 @@ use crate::params::PublishParams;
 use crate::publisher::Publisher;
 use crate::reports::Reports;
 use crate::status::PublishedStatus;
+use crate::submap_stream::SubmapStream;
 use crate::transport::{Delivery, Sample, Topic};
 use splat_msgs::correction_message::{self, MapCorrectionMsg};
 use splat_msgs::map_messages::{MAX_MESSAGE_BYTES, Messages, SplatDelta, splats_per_message};
@@ -35,6 +36,7 @@ pub static TOPICS: [&Topic; 2] = [&DELTA, &CORRECTION];
 pub struct MapStream {
     params: PublishParams,
     published: PublishedMap,
+    submaps: SubmapStream,
     since_whole: Option<Stopwatch>,
     /// The newest snapshot that was to go out.
     last: Option<Arc<Snapshot>>,
@@ -80,11 +82,21 @@ impl MapStream {
         Self {
             params: params.clone(),
             published: PublishedMap::default(),
+            submaps: SubmapStream::default(),
             since_whole: None,
             last: None,
             reports,
             frames,
         }
+    }
+
+    /// Sends submaps without a known relation to the map, as far as they are new or have changed; they are all there are.
+    pub fn publish_submaps(
+        &mut self,
+        publisher: &Publisher,
+        submaps: &[Arc<Snapshot>],
+    ) -> Result<(), PublishError> {
+        self.submaps.publish(publisher, submaps)
     }
 
     /// Sends a snapshot: what changed since the one before, or the whole of it, as the last one always goes out; `n_queued`
