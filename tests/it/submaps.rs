@@ -8,6 +8,7 @@ use crate::loops::{Filmed, film};
 use crate::sfm::params;
 use splat_engine::cpu::engine::CpuEngine;
 use splat_geometry::answer::{GeometryBatch, PoseUpdate, View};
+use splat_mapper::node::page_file::PageFile;
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::mapper::reports::SubmapReport;
 use splat_slam::mapper::params::MapperParams;
@@ -356,4 +357,58 @@ fn parked_submaps_that_join_each_other_are_parked_as_one() {
         let wanted = back.transform_point(point(b.splats.means[was]));
         assert!(point(both.splats.means[is]).distance(wanted) < 1e-3);
     }
+}
+
+#[test]
+fn a_device_that_is_lost_costs_no_parked_submap() {
+    let filmed = filmed();
+    let mut map = map(small());
+    add_both(&mut map, &filmed, 10);
+    let before = parked(&map);
+    map.recover(Box::new(CpuEngine::new())).unwrap();
+    assert_eq!(parked(&map), before);
+    map.step(5, End::Unknown).unwrap();
+    join(&mut map, &filmed);
+    assert!(parked(&map).is_empty());
+    let after = map.snapshot().unwrap();
+    let n_back = after
+        .splats
+        .anchors
+        .iter()
+        .filter(|anchor| of_first(**anchor));
+    assert_eq!(n_back.count(), before[0].1.splats.len());
+    let old = psnr(&mut map, 2);
+    map.step(60, End::Unknown).unwrap();
+    let new = psnr(&mut map, 2);
+    assert!(
+        new > old,
+        "views of the old part are trained on: {old:.2}, {new:.2} dB"
+    );
+}
+
+#[test]
+fn images_of_parked_keyframes_leave_memory_first_and_come_back_in_the_units_of_the_map() {
+    let filmed = filmed();
+    let mut params = small();
+    params.map.max_resident_keyframes = 14;
+    let pages = PageFile::new(None, params.map.max_page_file_mib << 20);
+    let mut map = map(params).paging_to(Box::new(pages));
+    add_both(&mut map, &filmed, 20);
+    let budgets = map.budgets();
+    assert_eq!(budgets.images_lost, 0);
+    assert!(map.has_all_images(), "those of the map stay");
+    join(&mut map, &filmed);
+    assert!(map.budgets().peak_keyframes_in_ram <= 14);
+    let (before, n) = (psnr(&mut map, 2), map.n_splats());
+    // They take turns: depth of another unit would push splats away.
+    for _ in 0..8 {
+        map.step(50, End::Unknown).unwrap();
+    }
+    let after = psnr(&mut map, 2);
+    eprintln!(
+        "{before:.2} -> {after:.2} dB, {n} -> {} splats",
+        map.n_splats()
+    );
+    assert!(after > before, "{before:.2} -> {after:.2} dB");
+    assert_eq!(map.budgets().images_lost, 0);
 }

@@ -76,6 +76,14 @@ impl Parked {
             }
             None => before,
         };
+        if target.is_some() {
+            // Those that are not named have not moved in the world, and the frame is another.
+            let new_from_old = world_from_submap.inverse() * before;
+            for registered in self.keyframes.values_mut() {
+                let old = registered.submap_from_cam;
+                registered.submap_from_cam = new_from_old.transform_pose(&old);
+            }
+        }
         let unit = world_from_submap.scale / before.scale;
         let mut motions = BTreeMap::new();
         for update in own {
