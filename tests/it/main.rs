@@ -70,6 +70,7 @@ mod sizes;
 mod slam;
 mod source_errors;
 mod sources;
+mod stress;
 mod submap_runs;
 mod submaps;
 mod synthetic;
