@@ -158,6 +158,53 @@ fn frames_from_before_the_map_get_their_pose_on_a_second_look() {
 }
 
 #[test]
+fn a_second_look_waits_for_the_depth_of_the_keyframes_beside() {
+    let frames = &room()[..25];
+    let by_landmarks = TrackParams {
+        odometry: false,
+        ..params()
+    };
+    let mut tracker = Tracker::new(&by_landmarks);
+    for frame in frames {
+        tracker.track(frame);
+    }
+    // Live, depth comes to the newest keyframe first.
+    let all = views(frames);
+    let with_depth = |first: usize| -> Vec<KeyframeView> {
+        let no_depth = || DepthMap {
+            width_px: 0,
+            height_px: 0,
+            depth: Vec::new(),
+            confidence: Vec::new(),
+        };
+        let views = all.iter().cloned().enumerate();
+        let view = |(ix, view): (usize, KeyframeView)| KeyframeView {
+            depth: if ix < first {
+                Arc::new(no_depth())
+            } else {
+                view.depth
+            },
+            ..view
+        };
+        views.map(view).collect()
+    };
+    // Keyframes are every fourth: the last two have depth, which makes five frames with the first of them.
+    tracker.update(&with_depth(5));
+    assert_eq!(tracker.retry(usize::MAX), KEYFRAME_EVERY + 1);
+    assert_eq!(tracker.retry(usize::MAX), 0);
+    tracker.update(&with_depth(2));
+    assert_eq!(tracker.retry(usize::MAX), 3 * KEYFRAME_EVERY);
+    tracker.update(&with_depth(0));
+    assert_eq!(tracker.retry(usize::MAX), 2 * KEYFRAME_EVERY);
+    let tracks = tracker.finish(|| true);
+    for (track, frame) in tracks.frames.iter().zip(frames) {
+        let (pose, truth) = (track.refined.unwrap(), frame.truth.unwrap());
+        let shift = (pose.translation - truth.translation).length() / median_depth(frame);
+        assert!(shift < MAX_SHIFT, "{shift}");
+    }
+}
+
+#[test]
 fn a_blackout_is_declared_and_over_as_soon_as_there_is_light() {
     let frames = room();
     let mut tracker = Tracker::new(&params());

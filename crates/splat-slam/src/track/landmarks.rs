@@ -12,6 +12,7 @@ use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
 use splat_types::frame::Keyframe;
+use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
 /// Relative difference of neighbouring depths from which a corner may lie on either side of an edge.
@@ -66,6 +67,33 @@ pub(crate) struct Landmarks {
     /// Those that the map has no place for, such as those of a submap that is parked: they may come back with it, and their
     /// images need not be there by then.
     aside: BTreeMap<u32, StoredKeyframe>,
+    /// Of keyframes of the map whose depth is still to come; in order.
+    bare: Vec<Stamp>,
+}
+
+/// Which frames have landmarks on both sides.
+#[derive(Debug)]
+pub(crate) struct Reach {
+    held: Vec<Stamp>,
+    bare: Vec<Stamp>,
+}
+
+impl Reach {
+    /// Whether a frame lies between two keyframes with landmarks, or before the first, and none beside it is still to get
+    /// its own: farther ones, carried that far, let wrong poses through.
+    pub(crate) fn has(&self, stamp: Stamp) -> bool {
+        let next = self.held.partition_point(|held| *held < stamp);
+        let Some(after) = self.held.get(next) else {
+            return false;
+        };
+        let next_bare = self.bare.partition_point(|bare| *bare < stamp);
+        let (before, bare_before) = (
+            next.checked_sub(1).map(|ix| self.held[ix]),
+            next_bare.checked_sub(1).map(|ix| self.bare[ix]),
+        );
+        let is_bare_after = self.bare.get(next_bare).is_some_and(|bare| bare < after);
+        *after == stamp || (!is_bare_after && bare_before <= before)
+    }
 }
 
 impl Landmarks {
@@ -82,11 +110,15 @@ impl Landmarks {
             .partition(|(id, _)| ids.contains_key(id));
         self.held = held;
         self.aside.extend::<BTreeMap<u32, StoredKeyframe>>(gone);
+        self.bare.clear();
         for (id, view) in ids {
             let held = self.held.remove(&id).or_else(|| self.aside.remove(&id));
             let seen = match &held {
                 Some(held) => Arc::clone(&held.seen),
-                None if view.depth.width_px == 0 => continue,
+                None if view.depth.width_px == 0 => {
+                    self.bare.push(view.keyframe.frame.stamp);
+                    continue;
+                }
                 None => seen_before(view.keyframe.frame.seq)
                     .unwrap_or_else(|| Arc::new(Observation::of(&view.keyframe.frame, params))),
             };
@@ -99,6 +131,16 @@ impl Landmarks {
         }
         while self.held.len() + self.aside.len() > params.max_keyframes {
             self.aside.pop_first();
+        }
+        self.bare.sort_unstable();
+    }
+
+    pub(crate) fn reach(&self) -> Reach {
+        let mut held: Vec<Stamp> = self.held.values().map(|held| held.seen.stamp).collect();
+        held.sort_unstable();
+        Reach {
+            held,
+            bare: self.bare.clone(),
         }
     }
 

@@ -210,8 +210,14 @@ impl Tracker {
             seen,
             history_ix,
         });
-        if self.waiting.len() > self.params.max_deferred_frames {
-            self.waiting.pop_front();
+        if self.waiting.len() > self.params.max_deferred_frames
+            && let Some(oldest) = self.waiting.pop_front()
+        {
+            // Depth beside it may never come; what lies ahead of the map is no better known than before.
+            let mut held = self.landmarks.held.values();
+            if held.any(|held| held.seen.stamp >= oldest.stamp) {
+                self.retry_frame(&oldest);
+            }
         }
     }
 
@@ -265,18 +271,18 @@ impl Tracker {
     /// Gives frames that the map has reached since a pose by the keyframes on both sides of them, at most `n` frames.
     /// Returns how many were looked at.
     pub fn retry(&mut self, n: usize) -> usize {
-        let held = self.landmarks.held.values();
-        let newest = held.map(|held| held.seen.stamp).max();
-        let mut done = 0;
-        while done < n {
-            let is_reached = |w: &Waiting| newest.is_some_and(|newest| w.stamp <= newest);
-            if !self.waiting.front().is_some_and(is_reached) {
-                break;
+        let reach = self.landmarks.reach();
+        let (mut ix, mut done) = (0, 0);
+        while done < n
+            && let Some(waiting) = self.waiting.get(ix)
+        {
+            if !reach.has(waiting.stamp) {
+                ix += 1;
+                continue;
             }
-            let Some(waiting) = self.waiting.pop_front() else {
-                break;
-            };
-            self.retry_frame(&waiting);
+            if let Some(waiting) = self.waiting.remove(ix) {
+                self.retry_frame(&waiting);
+            }
             done += 1;
         }
         done
