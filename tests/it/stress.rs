@@ -1,7 +1,7 @@
 //! Inputs that go wrong for a while: a frozen image, the dark, a camera that is carried elsewhere, frames that are lost or
 //! late, few and many of them. Afterwards frames are tracked again, and no reported pose is wrong.
 //!
-//! The node runs on its threads as in a replay, where nothing depends on how fast they are.
+//! The node runs on its threads as in a replay, where nothing depends on how fast they are, and once live.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -37,8 +37,25 @@ const N_FRAMES: u32 = 120;
 const DISTURBED: Range<usize> = 60..90;
 /// From then on frames must be tracked again: a second after they show the room.
 const AGAIN: usize = DISTURBED.end + RATE as usize;
-/// Share of the path's extent by which a pose may be off. Undisturbed it is 0.4 %.
-const MAX_ERROR: f64 = 0.03;
+/// Shares of the path's extent by which poses may be off.
+#[derive(Clone, Copy)]
+struct Limits {
+    /// Reported when the frame came.
+    reported: f64,
+    /// Known in the end.
+    known: f64,
+}
+
+/// Undisturbed both are 0.4 %.
+const LIMITS: Limits = Limits {
+    reported: 0.03,
+    known: 0.03,
+};
+/// Early poses of a live run, by a map of few keyframes, are up to 4 % off on two cores that do other things besides.
+const LIVE_LIMITS: Limits = Limits {
+    reported: 0.1,
+    known: 0.03,
+};
 /// Share of the frames that must have a pose when they come, where nothing is in the way.
 const MIN_TRACKED: f64 = 0.9;
 
@@ -134,8 +151,9 @@ fn params() -> Params {
     settings.params().unwrap()
 }
 
-fn run(images: &[Frame]) -> Outcome {
-    let params = params();
+fn run(images: &[Frame], is_live: bool) -> Outcome {
+    let mut params = params();
+    params.source.rate = f64::from(u8::from(is_live));
     let lens = CameraModel {
         intrinsics: images[0].intrinsics.unwrap(),
         distortion: Distortion::None,
@@ -147,7 +165,7 @@ fn run(images: &[Frame]) -> Outcome {
     let job = Job {
         source,
         params,
-        is_live: false,
+        is_live,
         stop: Stop::default(),
         out: None,
         output: None,
@@ -184,7 +202,7 @@ fn worst(images: &[Frame], reported: &[Reported]) -> (f64, Option<Stamp>) {
 }
 
 /// No pose is wrong: neither those reported when frames came, nor what is known of them in the end, nor those of keyframes.
-fn assert_none_is_wrong(what: &str, images: &[Frame], outcome: &Outcome) {
+fn assert_none_is_wrong(what: &str, images: &[Frame], outcome: &Outcome, limits: Limits) {
     let truth = |stamp: Stamp| {
         let shown = images.iter().find(|frame| frame.stamp == stamp);
         shown.unwrap().truth.unwrap()
@@ -199,11 +217,11 @@ fn assert_none_is_wrong(what: &str, images: &[Frame], outcome: &Outcome) {
     let keyframes = outcome.snapshot.poses.iter();
     let keyframes = keyframes.map(|k| (k.stamp, truth(k.stamp), k.world_from_cam));
     let all = [
-        ("when it came", reported(&|t| t.live)),
-        ("in the end", reported(&|t| t.refined)),
-        ("as a keyframe", keyframes.collect()),
+        ("when it came", limits.reported, reported(&|t| t.live)),
+        ("in the end", limits.known, reported(&|t| t.refined)),
+        ("as a keyframe", limits.known, keyframes.collect()),
     ];
-    for (when, reported) in all {
+    for (when, limit, reported) in all {
         let (error, at) = worst(images, &reported);
         let n = reported.len();
         eprintln!(
@@ -211,7 +229,7 @@ fn assert_none_is_wrong(what: &str, images: &[Frame], outcome: &Outcome) {
             100.0 * error
         );
         assert!(
-            error < MAX_ERROR,
+            error < limit,
             "{what}: a frame is {error} off {when}: {at:?}"
         );
     }
@@ -263,8 +281,8 @@ fn assert_uncertain(what: &str, frames: &[FrameTrack]) {
 fn a_frozen_image_is_no_camera_at_rest() {
     let still = Arc::clone(&walk()[DISTURBED.start - 1].image);
     let images = walk_showing(&still);
-    let outcome = run(&images);
-    assert_none_is_wrong("frozen", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("frozen", &images, &outcome, LIMITS);
     assert_uncertain("frozen", &outcome.tracking.tracks.frames[DISTURBED]);
     assert_tracked("frozen", &outcome, AGAIN);
     assert_lost_and_found("frozen", &outcome);
@@ -279,8 +297,8 @@ fn black() -> Arc<RgbImage> {
 #[test]
 fn two_seconds_in_the_dark_end_where_the_camera_has_gone_meanwhile() {
     let images = walk_showing(&black());
-    let outcome = run(&images);
-    assert_none_is_wrong("dark", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("dark", &images, &outcome, LIMITS);
     assert_uncertain("dark", &outcome.tracking.tracks.frames[DISTURBED]);
     assert_tracked("dark", &outcome, AGAIN);
     assert_lost_and_found("dark", &outcome);
@@ -302,8 +320,8 @@ fn kidnapped() -> Vec<Frame> {
 #[test]
 fn a_camera_that_is_carried_to_a_known_place_is_found_there() {
     let images = kidnapped();
-    let outcome = run(&images);
-    assert_none_is_wrong("kidnapped", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("kidnapped", &images, &outcome, LIMITS);
     assert_tracked("kidnapped", &outcome, AGAIN);
     assert_lost_and_found("kidnapped", &outcome);
 }
@@ -314,8 +332,8 @@ fn three_of_ten_frames_may_be_lost() {
     let mut images = walk();
     images.retain(|_| random.random_range(0.0..1.0) >= 0.3);
     assert!((75..95).contains(&images.len()), "{}", images.len());
-    let outcome = run(&images);
-    assert_none_is_wrong("30 % lost", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("30 % lost", &images, &outcome, LIMITS);
     assert_tracked("30 % lost", &outcome, RATE as usize);
 }
 
@@ -330,30 +348,30 @@ fn frames_that_come_late_are_counted_and_left_out() {
     images.insert(33 + RATE as usize, late);
     let twice = images[75].clone();
     images.insert(76, twice);
-    let outcome = run(&images);
+    let outcome = run(&images, false);
     let counts = outcome.input.counts.clone();
     assert_eq!(counts.out_of_order, n_late as u64);
     assert_eq!(counts.received, images.len() as u64);
     let tracks = &outcome.tracking.tracks;
     assert_eq!(tracks.n_frames, (images.len() - n_late) as u64);
     assert!(tracks.frames.is_sorted_by(|a, b| a.stamp < b.stamp));
-    assert_none_is_wrong("late", &images, &outcome);
+    assert_none_is_wrong("late", &images, &outcome, LIMITS);
     assert_tracked("late", &outcome, RATE as usize + 5);
 }
 
 #[test]
 fn five_frames_a_second_are_enough() {
     let images: Vec<Frame> = walk().into_iter().step_by(3).collect();
-    let outcome = run(&images);
-    assert_none_is_wrong("5 Hz", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("5 Hz", &images, &outcome, LIMITS);
     assert_tracked("5 Hz", &outcome, 8);
 }
 
 #[test]
 fn sixty_frames_a_second_are_not_too_many() {
     let images = frames(settings(0, 60), 0..200);
-    let outcome = run(&images);
-    assert_none_is_wrong("60 Hz", &images, &outcome);
+    let outcome = run(&images, false);
+    assert_none_is_wrong("60 Hz", &images, &outcome, LIMITS);
     assert_tracked("60 Hz", &outcome, 90);
 }
 
@@ -373,7 +391,7 @@ fn carried_away() -> Vec<Frame> {
 #[test]
 fn a_camera_that_is_carried_to_an_unknown_place_maps_it_on_its_own() {
     let images = carried_away();
-    let outcome = run(&images);
+    let outcome = run(&images, false);
     let frames = &outcome.tracking.tracks.frames;
     assert_uncertain("carried away", &frames[DISTURBED.end..]);
     let in_room = &images[..DISTURBED.end];
@@ -382,5 +400,23 @@ fn a_camera_that_is_carried_to_an_unknown_place_maps_it_on_its_own() {
     let is_known = |stamp| in_room.iter().any(|frame| frame.stamp == stamp);
     let keyframes = &outcome.snapshot.poses;
     assert!(keyframes.iter().all(|keyframe| is_known(keyframe.stamp)));
-    assert_none_is_wrong("carried away", in_room, &outcome);
+    assert_none_is_wrong("carried away", in_room, &outcome, LIMITS);
+}
+
+#[test]
+fn a_live_run_measures_nothing_in_the_dark_and_nothing_wrong_after_it() {
+    let images = walk_showing(&black());
+    let outcome = run(&images, true);
+    let in_dark = |t: &&FrameTrack| images[DISTURBED].iter().any(|frame| frame.stamp == t.stamp);
+    let mut dark = outcome.tracking.tracks.frames.iter().filter(in_dark);
+    assert!(dark.all(|t| t.live.is_none() && t.refined.is_none()));
+    assert_none_is_wrong("live, dark", &images, &outcome, LIVE_LIMITS);
+}
+
+#[test]
+fn a_live_run_reports_nothing_wrong_of_a_camera_that_is_carried_elsewhere() {
+    let mut images = kidnapped();
+    images.truncate(AGAIN);
+    let outcome = run(&images, true);
+    assert_none_is_wrong("live, kidnapped", &images, &outcome, LIVE_LIMITS);
 }
