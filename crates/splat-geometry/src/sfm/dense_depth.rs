@@ -70,10 +70,10 @@ impl Densifier {
     /// The poses of a batch; its depth comes by `next`.
     pub(crate) fn poses(
         &mut self,
-        sparse: SparseBatch,
+        sparse: &SparseBatch,
         image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>,
     ) -> GeometryBatch {
-        self.take_in(&sparse, image_of);
+        self.take_in(sparse, image_of);
         for revision in &sparse.revised {
             let at_work = self.at_work.iter_mut();
             for view in at_work.filter(|view| view.keyframe_id == revision.keyframe_id) {
@@ -84,7 +84,7 @@ impl Densifier {
             self.schedule.note_reported(view.keyframe_id);
         }
         let without_depth = |view| registered(view, DepthMap::none());
-        reported(&sparse, sparse.views.iter().map(without_depth).collect())
+        reported(sparse, sparse.views.iter().map(without_depth).collect())
     }
 
     /// Depth of one more view of those whose poses were reported. `view_of` gives a view as it is known by now. `None`: there is

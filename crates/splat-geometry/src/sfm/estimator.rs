@@ -461,7 +461,7 @@ impl Sfm {
 }
 
 impl Sfm {
-    fn with_poses(&mut self, sparse: SparseBatch) -> GeometryBatch {
+    fn with_poses(&mut self, sparse: &SparseBatch) -> GeometryBatch {
         let scene = &self.scene;
         GeometryBatch {
             load_shed: self.live.load_shed,
@@ -491,12 +491,12 @@ impl GeometryModel for Sfm {
 
     fn poses(&mut self, batch: &Batch) -> Option<GeometryBatch> {
         let sparse = self.sparse_soon(batch);
-        Some(self.with_poses(sparse))
+        Some(self.with_poses(&sparse))
     }
 
     fn refine(&mut self) -> Option<GeometryBatch> {
         let sparse = self.refined()?;
-        Some(self.with_poses(sparse))
+        Some(self.with_poses(&sparse))
     }
 
     fn adjustment(&mut self) -> Option<Work> {
@@ -510,7 +510,7 @@ impl GeometryModel for Sfm {
 
     fn take_adjustment(&mut self) -> Option<GeometryBatch> {
         let sparse = self.take_adjusted()?;
-        Some(self.with_poses(sparse))
+        Some(self.with_poses(&sparse))
     }
 
     fn depth(&mut self) -> Option<DepthTask> {
