@@ -17,3 +17,14 @@ impl Seeds {
         self.is_guess.truncate(n);
     }
 }
+
+/// What verified depth says of a guess.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Guess {
+    /// Nothing.
+    Open,
+    /// It lies on the surface.
+    Confirmed,
+    /// The surface is behind it, or something better is known of its place.
+    Replaced,
+}

@@ -15,7 +15,7 @@ use crate::mapper::params::MapperParams;
 use crate::mapper::splats::ids::SplatIds;
 use crate::mapper::splats::region_codec::region_bytes;
 use crate::mapper::splats::regions::Evicted;
-use crate::mapper::splats::seeds::Seeds;
+use crate::mapper::splats::seeds::{Guess, Seeds};
 use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
 use splat_types::camera::Intrinsics;
@@ -154,18 +154,29 @@ impl SplatSet {
         Ok(())
     }
 
-    /// Takes away guesses that verified depth has something better for.
-    pub(crate) fn take_guesses(
+    /// Judges all guesses: those that verified depth confirms are none any more, and those that it has something better for go.
+    pub(crate) fn judge_guesses(
         &mut self,
-        is_replaced: impl Fn(&Splats, usize) -> bool,
+        judge: impl Fn(&Splats, usize) -> Guess,
         engine: &mut dyn Engine,
     ) -> Result<(), EngineError> {
         if self.guessed.is_empty() {
             return Ok(());
         }
         let splats = engine.read()?;
-        let stays = |(ix, id)| !(self.guessed.contains(id) && is_replaced(&splats, ix));
-        let keep: Vec<bool> = self.ids.all().iter().enumerate().map(stays).collect();
+        let mut keep = vec![true; splats.len()];
+        for (ix, id) in self.ids.all().iter().enumerate() {
+            if !self.guessed.contains(id) {
+                continue;
+            }
+            match judge(&splats, ix) {
+                Guess::Open => {}
+                Guess::Confirmed => {
+                    self.guessed.remove(id);
+                }
+                Guess::Replaced => keep[ix] = false,
+            }
+        }
         if keep.iter().any(|k| !k) {
             self.retain(&keep, engine)?;
         }

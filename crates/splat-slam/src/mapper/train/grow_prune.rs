@@ -7,7 +7,7 @@ use rand::Rng;
 
 use crate::mapper::params::RelocationRule;
 use crate::mapper::parts::Parts;
-use crate::mapper::splats::seeds::Seeds;
+use crate::mapper::splats::seeds::{Guess, Seeds};
 use crate::mapper::train::seed::{self, SeedView};
 use crate::mapper::train::transient;
 use splat_engine::error::EngineError;
@@ -23,6 +23,8 @@ use splat_types::transform::Rigid;
 /// is not under optimisation, and its splats are no measure of anything.
 const ACTIVE_ROUNDS: usize = 4;
 const MIN_ACTIVE_STEPS: usize = 500;
+/// A guess that is off by a smaller part of its depth lies on the surface: steps move it the rest of the way.
+const SAME_SURFACE: f64 = 0.02;
 
 /// Splats where a keyframe's depth says that the map has a hole or is wrong.
 pub(crate) fn seed_from(
@@ -53,9 +55,9 @@ pub(crate) fn seed_provisional(
     map.splats.append_seeds(&seeds, map.engine)
 }
 
-/// Guessed splats go where a keyframe's depth, new or better, says more: those that it was given itself, and what others guessed
-/// at or before a surface that it has verified.
-pub(crate) fn take_guesses(map: &mut Parts<'_>, keyframe_id: u32) -> Result<(), EngineError> {
+/// Guessed splats meet a keyframe's depth, new or better: those on a surface that it has verified are right and stay, those at or
+/// before one go, and so do all others that it was given itself.
+pub(crate) fn judge_guesses(map: &mut Parts<'_>, keyframe_id: u32) -> Result<(), EngineError> {
     let Some((lens, cam_from_world)) = camera(map, keyframe_id)? else {
         return Ok(());
     };
@@ -64,18 +66,21 @@ pub(crate) fn take_guesses(map: &mut Parts<'_>, keyframe_id: u32) -> Result<(), 
     };
     let depth = &registered.depth;
     let lens = lens.resized(depth.width_px, depth.height_px);
-    let is_replaced = |splats: &Splats, ix: usize| {
-        if splats.anchors[ix] == keyframe_id {
-            return true;
-        }
+    let judge = |splats: &Splats, ix: usize| {
         let mean = DVec3::from(splats.means[ix].map(f64::from));
         let in_cam = cam_from_world.transform_point(mean);
-        let pixel = lens.project(in_cam);
-        let at = pixel.and_then(|pixel| depth.pixel_at(pixel));
-        let verified = at.and_then(|at| depth.verified(at));
-        verified.is_some_and(|(z, _)| in_cam.z < f64::from(seed::DEPTH_RATIO * z))
+        let at = lens.project(in_cam).and_then(|pixel| depth.pixel_at(pixel));
+        let ratio = at
+            .and_then(|at| depth.verified(at))
+            .map(|(z, _)| in_cam.z / f64::from(z));
+        match ratio {
+            Some(ratio) if (ratio - 1.0).abs() < SAME_SURFACE => Guess::Confirmed,
+            Some(ratio) if ratio < f64::from(seed::DEPTH_RATIO) => Guess::Replaced,
+            _ if splats.anchors[ix] == keyframe_id => Guess::Replaced,
+            _ => Guess::Open,
+        }
     };
-    map.splats.take_guesses(is_replaced, map.engine)
+    map.splats.judge_guesses(judge, map.engine)
 }
 
 fn seeds(

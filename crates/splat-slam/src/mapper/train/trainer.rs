@@ -180,7 +180,7 @@ impl Trainer {
         fills_gaps: bool,
     ) -> Result<(), EngineError> {
         ids.iter().try_for_each(|id| {
-            grow_prune::take_guesses(map, *id)?;
+            grow_prune::judge_guesses(map, *id)?;
             grow_prune::seed_from(map, &mut self.rng, *id, fills_gaps)
         })
     }
