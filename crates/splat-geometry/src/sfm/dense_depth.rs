@@ -98,13 +98,15 @@ impl Densifier {
         }
         while let Some(due) = self.schedule.next() {
             let (id, is_forced) = match due {
-                Due::Match(id) => (id, true),
-                Due::Verify(id) => (id, false),
+                Due::Match(id) => {
+                    self.schedule.note_matched(id);
+                    (id, true)
+                }
+                Due::Verify(id) => {
+                    self.schedule.note_verified(id);
+                    (id, false)
+                }
             };
-            match due {
-                Due::Match(id) => self.schedule.note_matched(id),
-                Due::Verify(id) => self.schedule.note_verified(id),
-            }
             let Some(view) = view_of(id).filter(|_| self.state.holds(id)) else {
                 continue;
             };

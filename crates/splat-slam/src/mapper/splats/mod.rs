@@ -13,3 +13,5 @@ pub mod seeds;
 pub(crate) mod store;
 
 pub(crate) mod aside;
+
+mod guesses;
