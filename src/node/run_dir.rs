@@ -142,7 +142,7 @@ fn write_map(
     let landmarks = std::mem::take(&mut outcome.tracking.landmarks);
     let checkpoint = outcome.map.checkpoint(landmarks);
     let live = frames::live_trajectory(&outcome.tracking.tracks.frames);
-    let results: [anyhow::Result<()>; 7] = [
+    let results: [anyhow::Result<()>; 8] = [
         save(MapFile::Checkpoint(&checkpoint), &out.join("map.splatmap")),
         save(MapFile::Ply(&outcome.snapshot.splats), &out.join("map.ply")),
         write_tum(keyframes, &out.join("keyframes.tum")).map_err(Into::into),
@@ -150,10 +150,9 @@ fn write_map(
         write_tum(&frames::trajectory(rows), &out.join("trajectory.tum")).map_err(Into::into),
         write_tum(&live, &out.join("trajectory_live.tum")).map_err(Into::into),
         frames::write_frames(rows, &out.join("frames.csv")).map_err(Into::into),
+        write_submaps(outcome, out),
     ];
-    let written: anyhow::Result<()> = results.into_iter().collect();
-    let submaps = write_submaps(outcome, out);
-    written.and(submaps)
+    results.into_iter().collect()
 }
 
 /// Splats of submaps that are not the map, each in a frame of its own.

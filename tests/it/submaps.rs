@@ -91,17 +91,22 @@ fn add_both(map: &mut Mapper, filmed: &Filmed, steps: u64) {
     }
 }
 
-/// A loop: all of the second part is by now in the first one's submap.
-fn join(map: &mut Mapper, filmed: &Filmed) {
-    let revised = filmed.views[FIRST..].iter().map(|view| PoseUpdate {
+/// Views of the second part's submap are by now in the first one's.
+fn gone_over(views: &[View]) -> Vec<PoseUpdate> {
+    let update = |view: &View| PoseUpdate {
         keyframe_id: view.keyframe_id,
         submap: 0,
         intrinsics: view.intrinsics,
         submap_from_cam: view.submap_from_cam,
         depth_factor: 1.0 / second_from_first().scale,
-    });
+    };
+    views.iter().map(update).collect()
+}
+
+/// A loop: all of the second part is by now in the first one's submap.
+fn join(map: &mut Mapper, filmed: &Filmed) {
     let geometry = GeometryBatch {
-        revised: revised.collect(),
+        revised: gone_over(&filmed.views[FIRST..]),
         is_loop: true,
         ..GeometryBatch::default()
     };
@@ -332,15 +337,8 @@ fn parked_submaps_that_join_each_other_are_parked_as_one() {
     let [(0, a), (1, b)] = &parked(&map)[..] else {
         panic!("two are parked")
     };
-    let revised = filmed.views[8..16].iter().map(|view| PoseUpdate {
-        keyframe_id: view.keyframe_id,
-        submap: 0,
-        intrinsics: view.intrinsics,
-        submap_from_cam: view.submap_from_cam,
-        depth_factor: 1.0 / second_from_first().scale,
-    });
     let geometry = GeometryBatch {
-        revised: revised.collect(),
+        revised: gone_over(&filmed.views[8..16]),
         ..GeometryBatch::default()
     };
     map.add(None, &geometry, None).unwrap();

@@ -31,6 +31,24 @@ pub static TOPICS: [&Topic; 6] = [
     &SUBMAP_SPLATS,
 ];
 
+/// What the pieces of a map go out on.
+struct MapTopics {
+    manifest: &'static Topic,
+    keyframes: &'static Topic,
+    splats: &'static Topic,
+}
+
+static OF_MAP: MapTopics = MapTopics {
+    manifest: &MANIFEST,
+    keyframes: &KEYFRAMES,
+    splats: &SPLATS,
+};
+static OF_SUBMAPS: MapTopics = MapTopics {
+    manifest: &SUBMAP_MANIFEST,
+    keyframes: &SUBMAP_KEYFRAMES,
+    splats: &SUBMAP_SPLATS,
+};
+
 /// Bytes of a map's id that the frame of a submap is named after.
 const N_NAMED_BYTES: usize = 4;
 
@@ -139,38 +157,48 @@ impl LatchedStore {
         topic: &Topic,
         send: &mut dyn FnMut(&Sample) -> Result<(), PublishError>,
     ) -> Result<(), PublishError> {
-        if [&SUBMAP_KEYFRAMES, &SUBMAP_SPLATS, &SUBMAP_MANIFEST]
-            .iter()
-            .any(|of_submaps| of_submaps.name == topic.name)
-        {
+        let is_asked = |other: &Topic| other.name == topic.name;
+        if OF_SUBMAPS.all().into_iter().any(is_asked) {
             let submaps = self.kept().submaps.clone();
             return submaps.iter().try_for_each(|submap| {
-                send_submap(&self.submap_messages(submap), &mut |post| {
-                    let is_asked = post.topic.name == topic.name;
-                    if is_asked { send(post) } else { Ok(()) }
-                })
+                let messages = self.submap_messages(submap);
+                OF_SUBMAPS.send(&messages, &is_asked, send)
             });
         }
-        let is_of_map = [&KEYFRAMES, &SPLATS, &MANIFEST]
-            .iter()
-            .any(|of_map| of_map.name == topic.name);
-        if !is_of_map {
-            let newest = self.kept().newest.get(topic.name).cloned();
-            return newest.as_ref().map_or(Ok(()), send);
+        if OF_MAP.all().into_iter().any(is_asked) {
+            return self.map().map_or(Ok(()), |map| {
+                OF_MAP.send(&self.messages(&map), &is_asked, send)
+            });
         }
-        let Some(map) = self.map() else {
-            return Ok(());
-        };
-        let (messages, stamp) = (self.messages(&map), map.snapshot.stamp);
-        if topic.name == MANIFEST.name {
-            send(&Sample::of(&MANIFEST, stamp, &messages.manifest())?)?;
-        } else if topic.name == KEYFRAMES.name {
+        let newest = self.kept().newest.get(topic.name).cloned();
+        newest.as_ref().map_or(Ok(()), send)
+    }
+}
+
+impl MapTopics {
+    fn all(&self) -> [&'static Topic; 3] {
+        [self.manifest, self.keyframes, self.splats]
+    }
+
+    /// Messages of those topics that are asked for.
+    fn send(
+        &self,
+        messages: &Messages<'_>,
+        is_asked: &dyn Fn(&Topic) -> bool,
+        send: &mut dyn FnMut(&Sample) -> Result<(), PublishError>,
+    ) -> Result<(), PublishError> {
+        let stamp = messages.snapshot.stamp;
+        if is_asked(self.manifest) {
+            send(&Sample::of(self.manifest, stamp, &messages.manifest())?)?;
+        }
+        if is_asked(self.keyframes) {
             for array in messages.keyframes() {
-                send(&Sample::of(&KEYFRAMES, stamp, &array)?)?;
+                send(&Sample::of(self.keyframes, stamp, &array)?)?;
             }
-        } else {
+        }
+        if is_asked(self.splats) {
             for chunk in messages.chunks() {
-                send(&Sample::of(&SPLATS, stamp, &chunk)?)?;
+                send(&Sample::of(self.splats, stamp, &chunk)?)?;
             }
         }
         Ok(())
@@ -182,13 +210,5 @@ pub(crate) fn send_submap(
     messages: &Messages<'_>,
     send: &mut dyn FnMut(&Sample) -> Result<(), PublishError>,
 ) -> Result<(), PublishError> {
-    let stamp = messages.snapshot.stamp;
-    send(&Sample::of(&SUBMAP_MANIFEST, stamp, &messages.manifest())?)?;
-    for array in messages.keyframes() {
-        send(&Sample::of(&SUBMAP_KEYFRAMES, stamp, &array)?)?;
-    }
-    for chunk in messages.chunks() {
-        send(&Sample::of(&SUBMAP_SPLATS, stamp, &chunk)?)?;
-    }
-    Ok(())
+    OF_SUBMAPS.send(messages, &|_| true, send)
 }

@@ -32,6 +32,13 @@ struct Waiting {
     is_verified: bool,
 }
 
+impl Waiting {
+    /// It was matched with enough keyframes after it.
+    fn has_later_sources(&self) -> bool {
+        self.n_later_when_matched.is_some_and(|n| n >= N_LATER)
+    }
+}
+
 /// What is to be done for a keyframe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Due {
@@ -53,11 +60,10 @@ impl DepthSchedule {
 
     /// The pose of a keyframe has been reported; of one that was reported before nothing changes.
     pub(crate) fn note_reported(&mut self, keyframe_id: u32) {
-        let newest = self.keyframes.last_key_value();
-        if newest.is_some_and(|(newest, _)| *newest >= keyframe_id)
-            && (self.keyframes.contains_key(&keyframe_id)
-                || self.keyframes.len() >= self.max_keyframes)
-        {
+        let newest = self.keyframes.last_key_value().map(|(id, _)| *id);
+        let is_full = self.keyframes.len() >= self.max_keyframes;
+        let is_old = is_full && newest.is_some_and(|newest| newest >= keyframe_id);
+        if is_old || self.keyframes.contains_key(&keyframe_id) {
             return;
         }
         let waiting = Waiting {
@@ -105,14 +111,16 @@ impl DepthSchedule {
             return Some(Due::Match(*id));
         }
         let is_early = |waiting: &Waiting| {
-            waiting.n_later_when_matched.is_some_and(|n| n < N_LATER) && n_later(waiting) >= N_LATER
+            waiting.n_later_when_matched.is_some()
+                && !waiting.has_later_sources()
+                && n_later(waiting) >= N_LATER
         };
         if let Some((id, _)) = newest_first().find(|(_, waiting)| is_early(waiting)) {
             return Some(Due::Match(*id));
         }
         let verifiable = self.keyframes.iter().find(|(_, waiting)| {
             !waiting.is_verified
-                && waiting.n_later_when_matched.is_some_and(|n| n >= N_LATER)
+                && waiting.has_later_sources()
                 && self.are_matched_after(waiting.number)
         });
         verifiable.map(|(id, _)| Due::Verify(*id))
@@ -123,7 +131,7 @@ impl DepthSchedule {
         let mut n_matched = 0;
         for waiting in self.keyframes.values() {
             if waiting.number > number && waiting.number <= number + N_LATER {
-                n_matched += u64::from(waiting.n_later_when_matched.is_some_and(|n| n >= N_LATER));
+                n_matched += u64::from(waiting.has_later_sources());
             }
         }
         n_matched == N_LATER

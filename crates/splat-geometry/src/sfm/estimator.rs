@@ -231,7 +231,7 @@ impl Sfm {
         let unmatched = self.densifier.unmatched();
         let again: Vec<usize> = unmatched
             .iter()
-            .filter_map(|id| self.view_of(*id))
+            .filter_map(|id| self.scene.view_of(*id))
             .collect();
         self.report(&again)
     }
@@ -270,7 +270,7 @@ impl Sfm {
         let limits = self.limits(keyframes);
         let fresh: Vec<&Arc<Keyframe>> = keyframes
             .iter()
-            .filter(|k| self.view_of(k.id).is_none())
+            .filter(|k| self.scene.view_of(k.id).is_none())
             .collect();
         let looked = |keyframe: &&Arc<Keyframe>| {
             let image = working_image(&keyframe.frame.image, self.sfm.max_side);
@@ -304,7 +304,7 @@ impl Sfm {
     /// Views of the keyframes that the batch before had, too.
     pub(crate) fn shared_views(&self, batch: &Batch) -> Vec<usize> {
         let shared = batch.keyframes.iter().take(batch.n_shared);
-        shared.filter_map(|k| self.view_of(k.id)).collect()
+        shared.filter_map(|k| self.scene.view_of(k.id)).collect()
     }
 
     fn limits(&self, keyframes: &[Arc<Keyframe>]) -> Limits {
@@ -325,14 +325,6 @@ impl Sfm {
             is_global_deferred: self.live.is_on,
             seed: self.seed,
         }
-    }
-
-    fn view_of(&self, keyframe_id: u32) -> Option<usize> {
-        // The newest are asked for most.
-        self.scene
-            .views
-            .iter()
-            .rposition(|s| s.keyframe.id == keyframe_id)
     }
 
     /// Adds a view whose features are given in a working image of that size.
@@ -515,10 +507,7 @@ impl GeometryModel for Sfm {
 
     fn depth(&mut self) -> Option<DepthTask> {
         let scene = &self.scene;
-        let view_of = |id| {
-            let view_ix = scene.views.iter().rposition(|v| v.keyframe.id == id)?;
-            updates::view(scene, view_ix)
-        };
+        let view_of = |id| updates::view(scene, scene.view_of(id)?);
         Some(match self.densifier.next(&view_of)? {
             NextDepth::Known(view) => DepthTask::Known(self.with_depth(*view)),
             NextDepth::Sweep(job) => DepthTask::Sweep(job),

@@ -152,13 +152,16 @@ impl Reconstruction {
         self.undistorted.of(size, &view.lens)
     }
 
+    /// Index of a keyframe's view.
+    pub(crate) fn view_of(&self, keyframe_id: u32) -> Option<usize> {
+        // The newest are asked for most.
+        let mut views = self.views.iter();
+        views.rposition(|view| view.keyframe.id == keyframe_id)
+    }
+
     /// Intrinsics at the size of the keyframe's image; of the straight one, where its lens bends.
     pub(crate) fn intrinsics_of(&self, keyframe_id: u32) -> Option<Intrinsics> {
-        let view = self
-            .views
-            .iter()
-            .rev()
-            .find(|s| s.keyframe.id == keyframe_id)?;
+        let view = &self.views[self.view_of(keyframe_id)?];
         if let Some((_, pinhole)) = self.undistorted_of(view) {
             return Some(pinhole);
         }
@@ -171,11 +174,7 @@ impl Reconstruction {
     }
 
     pub(crate) fn image_of(&self, keyframe_id: u32) -> Option<Arc<RgbImage>> {
-        let view = self
-            .views
-            .iter()
-            .rev()
-            .find(|s| s.keyframe.id == keyframe_id)?;
+        let view = &self.views[self.view_of(keyframe_id)?];
         let image = &view.keyframe.frame.image;
         (!image.is_unloaded()).then(|| Arc::clone(image))
     }

@@ -230,12 +230,7 @@ impl Tracker {
     /// Takes over what the map says: all of its keyframes, with their poses of this moment.
     pub fn update(&mut self, views: &[KeyframeView]) {
         let before = self.anchor.and_then(|anchor| self.pose_by(&anchor));
-        let unit_of = |keyframes: &BTreeMap<u32, (Rigid, f64)>, anchor: Anchor| {
-            keyframes.get(&anchor.keyframe_id).map(|(_, unit)| *unit)
-        };
-        let old_unit = self
-            .anchor
-            .and_then(|anchor| unit_of(&self.keyframes, anchor));
+        let old_unit = unit_at(self.anchor, &self.keyframes);
         let kept = self.waiting.iter();
         let kept: BTreeMap<u64, &Arc<Observation>> = kept
             .filter_map(|w| Some((w.seq, w.seen.as_ref()?)))
@@ -255,9 +250,7 @@ impl Tracker {
             self.history.express_in_map(&initialisation);
         }
         let after = self.anchor.and_then(|anchor| self.pose_by(&anchor));
-        let unit = self
-            .anchor
-            .and_then(|anchor| unit_of(&self.keyframes, anchor));
+        let unit = unit_at(self.anchor, &self.keyframes);
         match (before.zip(after), self.motion.as_mut()) {
             (Some((before, after)), Some(motion)) => {
                 let unit = unit.zip(old_unit).map_or(1.0, |(new, old)| new / old);
@@ -484,6 +477,11 @@ impl Tracker {
 /// where the camera was, not where it is.
 fn repeats(last: Option<&(Stamp, Arc<RgbImage>)>, frame: &Frame) -> bool {
     last.is_some_and(|(_, image)| *image == frame.image)
+}
+
+/// Length of the map's unit at the keyframe that a pose hangs on.
+fn unit_at(anchor: Option<Anchor>, keyframes: &BTreeMap<u32, (Rigid, f64)>) -> Option<f64> {
+    keyframes.get(&anchor?.keyframe_id).map(|(_, unit)| *unit)
 }
 
 fn place_variance(covariance: &Matrix6<f64>) -> f64 {

@@ -172,21 +172,22 @@ impl Mapper {
     fn take_splats(&mut self, splats: &Splats, update_counts: &[u16]) -> Result<(), EngineError> {
         self.measure_depths(splats)?;
         self.keyframes.measure_scene();
-        let away = self.keyframes.distances(&mut *self.engine)?;
         self.splats.append(splats, &mut *self.engine)?;
         self.report_renumbered();
         if !update_counts.is_empty() {
             self.engine.set_update_counts(0, update_counts)?;
         }
-        let n_over = self.engine.len().saturating_sub(self.capacity());
-        if n_over > 0 {
-            self.evict_far((n_over, -1.0), &away)?;
-        }
-        self.leave_out_surplus("the saved map")
+        self.make_fit("the saved map")
     }
 
-    /// What has no room in memory, and none on disk.
-    fn leave_out_surplus(&mut self, whose: &str) -> Result<(), EngineError> {
+    /// After splats came in: those that memory has no room for go to disk, and what has none there is left out.
+    pub(super) fn make_fit(&mut self, whose: &str) -> Result<(), EngineError> {
+        let n_over = self.engine.len().saturating_sub(self.capacity());
+        if n_over == 0 {
+            return Ok(());
+        }
+        let away = self.keyframes.distances(&mut *self.engine)?;
+        self.evict_far((n_over, -1.0), &away)?;
         let n_over = self.engine.len().saturating_sub(self.capacity());
         if n_over > 0 {
             tracing::warn!("{n_over} splats of {whose} have no room and are left out");
@@ -195,17 +196,6 @@ impl Mapper {
             self.splats.retain(&keep, &mut *self.engine)?;
         }
         Ok(())
-    }
-
-    /// After splats came in beside those that were there.
-    pub(super) fn make_fit(&mut self, whose: &str) -> Result<(), EngineError> {
-        let n_over = self.engine.len().saturating_sub(self.capacity());
-        if n_over == 0 {
-            return Ok(());
-        }
-        let away = self.keyframes.distances(&mut *self.engine)?;
-        self.evict_far((n_over, -1.0), &away)?;
-        self.leave_out_surplus(whose)
     }
 
     /// What the budgets allow in all.
