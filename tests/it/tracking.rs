@@ -9,7 +9,7 @@ use rand_pcg::Pcg32;
 
 use splat_mapper::node::open_source;
 use splat_mapper::params::settings::Settings;
-use splat_slam::track::landmarks::KeyframeView;
+use splat_slam::track::landmarks::{KeyframeView, TriangulatedLandmarks};
 use splat_slam::track::params::TrackParams;
 use splat_slam::track::tracker::Tracker;
 use splat_types::depth::DepthMap;
@@ -53,6 +53,7 @@ fn view(id: usize, frame: &Frame) -> KeyframeView {
         intrinsics: frame.intrinsics.unwrap(),
         lens: None,
         depth: Arc::clone(frame.sensor_depth.as_ref().unwrap()),
+        landmarks: TriangulatedLandmarks::none(),
         covariance: None,
     }
 }

@@ -59,7 +59,7 @@ pub(crate) fn scale_depths(
 fn rescale_depth(registered: &mut RegisteredKeyframe, factor: f64) {
     registered.depth = Arc::new(rescaled(&registered.depth, factor));
     registered.depth_fit.factor *= factor;
-    registered.median_depth = registered.depth.median();
+    registered.depth_fit.median = registered.depth.median();
 }
 
 /// Median of rendered over given depth, weighted by confidence: the factor of least absolute error, in closed form.

@@ -36,7 +36,7 @@ use crate::mapper::submaps::registry::Submaps;
 use crate::mapper::train::landmark_depth::landmark_depth;
 use crate::mapper::train::schedule::End;
 use crate::mapper::train::trainer::Trainer;
-use crate::track::landmarks::KeyframeView;
+use crate::track::landmarks::{KeyframeView, TriangulatedLandmarks};
 use splat_engine::error::EngineError;
 use splat_engine::settings::PoseMode;
 use splat_engine::traits::Engine;
@@ -513,8 +513,11 @@ impl Mapper {
                         intrinsics,
                         lens: view.lens,
                         depth,
-                        median_depth,
-                        depth_fit: DepthFit::default(),
+                        landmarks: TriangulatedLandmarks::none(),
+                        depth_fit: DepthFit {
+                            median: median_depth,
+                            ..DepthFit::default()
+                        },
                         health: view.health,
                         is_held_out,
                         home: Residency::here(),
@@ -526,6 +529,8 @@ impl Mapper {
                 fresh.push(id);
             }
         }
+        self.keyframes
+            .keep_landmarks(observations, world_from_submap.scale);
         self.keyframes.measure_scene();
         self.share_budget();
         self.splats.prune(&self.params, &mut *self.engine)?;

@@ -20,6 +20,10 @@ impl GreyImage {
         }
     }
 
+    pub(crate) fn empty() -> Self {
+        Self::zeros(0, 0)
+    }
+
     pub(crate) fn size(&self) -> (usize, usize) {
         (self.width, self.height)
     }

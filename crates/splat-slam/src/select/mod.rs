@@ -4,6 +4,8 @@ pub(crate) mod grey;
 
 pub mod params;
 
+pub(crate) mod image_shift;
+
 mod window;
 
 pub(crate) mod optical_flow;

@@ -41,12 +41,27 @@ pub(crate) struct Found {
 }
 
 impl Pyramid {
+    /// Without derivatives: what others are followed in, not from.
+    pub(crate) fn without_gradients(image: GreyImage, max_level: usize) -> Self {
+        Self::of(image, max_level, |_| {
+            [GreyImage::empty(), GreyImage::empty()]
+        })
+    }
+
     /// `max_level` halvings.
     pub(crate) fn new(image: GreyImage, max_level: usize) -> Self {
+        Self::of(image, max_level, GreyImage::gradients)
+    }
+
+    fn of(
+        image: GreyImage,
+        max_level: usize,
+        gradients: impl Fn(&GreyImage) -> [GreyImage; 2],
+    ) -> Self {
         let mut levels: Vec<Level> = Vec::with_capacity(max_level + 1);
         let mut image = Some(image);
         while let Some(next) = image.take() {
-            let gradients = next.gradients();
+            let gradients = gradients(&next);
             image = (levels.len() < max_level).then(|| next.halved());
             levels.push(Level {
                 image: next,
@@ -59,6 +74,20 @@ impl Pyramid {
     /// The image at full size.
     pub(crate) fn image(&self) -> &GreyImage {
         &self.levels[0].image
+    }
+
+    pub(crate) fn n_levels(&self) -> usize {
+        self.levels.len()
+    }
+
+    /// The image after so many halvings.
+    pub(crate) fn level(&self, level_ix: usize) -> Option<&GreyImage> {
+        self.levels.get(level_ix).map(|level| &level.image)
+    }
+
+    /// The image after the most halvings.
+    pub(crate) fn coarsest(&self) -> &GreyImage {
+        &self.levels[self.levels.len() - 1].image
     }
 
     /// The image at half size, where there is one.
@@ -95,6 +124,20 @@ pub(crate) fn optical_flow_near(
         Some((*point, expected.unwrap_or(anywhere)))
     };
     follow_each(from, to, points, begin)
+}
+
+/// The same for corners that have all moved by about one shift, on all levels.
+pub(crate) fn optical_flow_shifted(
+    from: &Pyramid,
+    to: &Pyramid,
+    points: &[[f32; 2]],
+    shift: [f32; 2],
+) -> Vec<Option<Found>> {
+    let begin = Begin {
+        shift,
+        ..Begin::anywhere(MIN_CORNER_EIGENVALUE)
+    };
+    follow_each(from, to, points, |point| Some((*point, begin)))
 }
 
 /// The same for points that may be anywhere within a seventh of the longer side: each begins where its

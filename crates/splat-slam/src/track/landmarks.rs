@@ -8,6 +8,7 @@ use glam::{DVec2, DVec3};
 use crate::track::observation::{Observation, UndistortedObservation};
 use crate::track::params::TrackParams;
 use crate::working_camera::WorkingCamera;
+use splat_geometry::answer::SeenLandmark;
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
@@ -33,8 +34,26 @@ pub struct KeyframeView {
     pub lens: Option<CameraModel>,
     /// In the map's unit.
     pub depth: Arc<DepthMap>,
+    pub landmarks: TriangulatedLandmarks,
     /// Of its pose, where known.
     pub covariance: Option<Covariance>,
+}
+
+/// Landmarks that the geometry model has triangulated, where a keyframe shows them.
+#[derive(Debug, Clone)]
+pub struct TriangulatedLandmarks {
+    pub seen: Arc<[SeenLandmark]>,
+    /// Units of the map in one of their depths.
+    pub unit: f64,
+}
+
+impl TriangulatedLandmarks {
+    pub fn none() -> Self {
+        Self {
+            seen: Arc::new([]),
+            unit: 1.0,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy)]

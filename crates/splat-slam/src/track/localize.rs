@@ -1,10 +1,12 @@
 //! One frame -> its pose: by the motion, by the keyframes around it, or by all keyframes without a hint; and the gates
 //! that a pose must pass.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
+use crate::track::align::{AlignedPoint, AlignmentFrame};
 use crate::track::landmarks::{Landmarks, StoredKeyframe};
+use crate::track::map_points::{MapPoints, PointKeyframe};
 use crate::track::matching::{Pairs, guided, unguided};
 use crate::track::motion::Motion;
 use crate::track::observation::{Observation, UndistortedObservation};
@@ -30,11 +32,15 @@ const MIN_SHARE: f64 = 0.1;
 const MIN_SHARE_SEARCHED: f64 = 0.18;
 /// Of the pairs that were looked for where the pose puts them; a pose that half of them contradict is that of another place.
 const MIN_SHARE_OF_PAIRS: f64 = 0.5;
+/// Of the points that were looked for.
+const MIN_SHARE_ALIGNED: f64 = 0.2;
 /// Least standard deviation of the inliers over the image, across where they spread most, share of the longer side;
 /// an even spread over an image of 4:3 has 0.22.
 const MIN_SPREAD: f64 = 0.05;
 /// Residuals that are larger by so much are those of another place.
 const MAX_SCALE: f64 = 2.5;
+/// The same of patches, which are found more exactly.
+const MAX_SCALE_ALIGNED: f64 = 6.0;
 /// A pose that is known no better says nothing: share of the depth of the scene, and radians.
 const MAX_STD_DEPTHS: f64 = 0.05;
 const MAX_STD_RAD: f64 = 0.05;
@@ -81,9 +87,12 @@ pub(crate) struct Hint<'a> {
 #[derive(Clone, Copy)]
 pub(crate) struct Localizer<'a> {
     pub(crate) landmarks: &'a Landmarks,
+    pub(crate) points: &'a MapPoints,
     pub(crate) params: &'a TrackParams,
     /// Design effect of the frames so far.
     pub(crate) design: f64,
+    /// Share of the landmarks that must agree otherwise: a pose that alignment has to confirm need not be clear.
+    pub(crate) share_needed: f64,
 }
 
 impl Localizer<'_> {
@@ -179,16 +188,20 @@ impl Localizer<'_> {
 
     fn tracking_gates(&self) -> Gates {
         Gates {
-            min_inliers: self.params.min_inliers,
-            min_share: MIN_SHARE,
+            min_inliers: self.needed(self.params.min_inliers),
+            min_share: self.share_needed * MIN_SHARE,
         }
     }
 
     fn search_gates(&self) -> Gates {
         Gates {
-            min_inliers: self.params.relocalise_inliers,
-            min_share: MIN_SHARE_SEARCHED,
+            min_inliers: self.needed(self.params.relocalise_inliers),
+            min_share: self.share_needed * MIN_SHARE_SEARCHED,
         }
+    }
+
+    fn needed(&self, n: usize) -> usize {
+        (self.share_needed * n as f64).ceil() as usize
     }
 
     /// The frame's corners where a pinhole would show them.
@@ -269,6 +282,55 @@ impl Localizer<'_> {
         self.judged(&fit, &pairs, most, (frame.1, gates))
     }
 
+    /// The pose near a guess by the points that keyframes show, and those that agree.
+    pub(crate) fn align(
+        &self,
+        frame: &AlignmentFrame<'_>,
+        keyframes: &[&PointKeyframe],
+        guess: &Rigid,
+    ) -> Result<(Localized, Vec<AlignedPoint>), LostReason> {
+        let needed = self.params.min_inliers;
+        let aligned = frame.align(keyframes, guess);
+        let aligned = aligned.ok_or(LostReason::TooFew { found: 0, needed })?;
+        let found = aligned.fit.inliers.len();
+        let needed = needed.max((MIN_SHARE_ALIGNED * aligned.n_asked as f64) as usize);
+        if found < needed {
+            return Err(LostReason::TooFew { found, needed });
+        }
+        let pinhole = &frame.camera.pinhole;
+        let longest = f64::from(pinhole.width_px.max(pinhole.height_px));
+        let pixels = aligned.points.iter().map(|point| point.pixel);
+        if spread(&pixels.collect::<Vec<_>>()) < MIN_SPREAD * longest {
+            return Err(LostReason::Crowded);
+        }
+        let reference = self.points.held.get(&aligned.reference);
+        let depth = reference.ok_or(LostReason::Unseen)?.median_depth();
+        self.is_known(&aligned.fit, MAX_SCALE_ALIGNED, depth)?;
+        let located = Localized {
+            cam_from_world: aligned.fit.cam_from_world,
+            covariance: aligned.fit.covariance,
+            design: aligned.fit.design,
+            n_inliers: found,
+            share: found as f64 / aligned.n_asked.max(1) as f64,
+            reference: aligned.reference,
+        };
+        Ok((located, aligned.points))
+    }
+
+    /// Whether a pose is known well enough to say something.
+    fn is_known(&self, fit: &Fit, max_scale: f64, scene_depth: f64) -> Result<(), LostReason> {
+        if fit.scale > max_scale {
+            return Err(LostReason::Inexact { times: fit.scale });
+        }
+        let std = |axis: usize| (fit.covariance[(axis, axis)] * self.design.max(1.0)).sqrt();
+        let far = (0..3).map(std).fold(0.0, f64::max);
+        let turned = (3..6).map(std).fold(0.0, f64::max);
+        if far > MAX_STD_DEPTHS * scene_depth || turned > MAX_STD_RAD {
+            return Err(LostReason::Open);
+        }
+        Ok(())
+    }
+
     fn judged(
         &self,
         fit: &Fit,
@@ -279,17 +341,16 @@ impl Localizer<'_> {
         let pinhole = &undistorted.camera.pinhole;
         let longest = f64::from(pinhole.width_px.max(pinhole.height_px));
         let of_seen = (gates.min_share * most as f64) as usize;
-        let of_pairs = (MIN_SHARE_OF_PAIRS * pairs.observations.len() as f64) as usize;
+        let of_pairs =
+            (self.share_needed * MIN_SHARE_OF_PAIRS * pairs.observations.len() as f64) as usize;
         let needed = gates.min_inliers.max(of_seen).max(of_pairs);
         let found = fit.inliers.len();
         if found < needed {
             return Err(LostReason::TooFew { found, needed });
         }
-        if spread(fit, pairs) < MIN_SPREAD * longest {
+        let pixels = fit.inliers.iter().map(|i| pairs.observations[*i].pixel);
+        if spread(&pixels.collect::<Vec<_>>()) < MIN_SPREAD * longest {
             return Err(LostReason::Crowded);
-        }
-        if fit.scale > MAX_SCALE {
-            return Err(LostReason::Inexact { times: fit.scale });
         }
         let reference = most_frequent(fit.inliers.iter().map(|i| pairs.keyframes[*i]));
         let held = self
@@ -297,12 +358,7 @@ impl Localizer<'_> {
             .held
             .get(&reference)
             .ok_or(LostReason::Unseen)?;
-        let std = |axis: usize| (fit.covariance[(axis, axis)] * self.design.max(1.0)).sqrt();
-        let far = (0..3).map(std).fold(0.0, f64::max);
-        let turned = (3..6).map(std).fold(0.0, f64::max);
-        if far > MAX_STD_DEPTHS * held.median_depth() || turned > MAX_STD_RAD {
-            return Err(LostReason::Open);
-        }
+        self.is_known(fit, MAX_SCALE, held.median_depth())?;
         Ok(Localized {
             cam_from_world: fit.cam_from_world,
             covariance: fit.covariance,
@@ -316,21 +372,32 @@ impl Localizer<'_> {
     /// Of the landmarks, with what they have in common, and of the keyframe itself.
     pub(crate) fn covariance(&self, located: &Localized) -> Matrix6<f64> {
         let mut covariance = located.covariance * self.design.max(1.0);
-        let Some(held) = self.landmarks.held.get(&located.reference) else {
+        let Some((world_from_key, of_key)) = self.keyframe(located.reference) else {
             return covariance;
         };
-        let cam_from_key = located.cam_from_world * held.world_from_cam;
+        let cam_from_key = located.cam_from_world * world_from_key;
         let away = cam_from_key.translation * (COMMON_SHARE * self.params.depth_error);
         let away = Vector3::new(away.x, away.y, away.z);
         let mut place = covariance.fixed_view_mut::<3, 3>(0, 0);
         place += away * away.transpose();
-        covariance + carried(held.covariance.as_ref(), &cam_from_key)
+        covariance + carried(of_key, &cam_from_key)
+    }
+
+    /// Where a keyframe stands, and its covariance where that is known.
+    fn keyframe(&self, id: u32) -> Option<(Rigid, Option<&Covariance>)> {
+        let held = self.landmarks.held.get(&id);
+        let held = held.map(|held| (held.world_from_cam, held.covariance.as_ref()));
+        held.or_else(|| {
+            let held = self.points.held.get(&id)?;
+            Some((held.world_from_cam, held.covariance.as_ref()))
+        })
     }
 
     /// What the keyframe's own covariance is worth at a camera that odometry has led away from it.
     pub(crate) fn covariance_of_key(&self, linked: &LinkedPose) -> Matrix6<f64> {
-        let held = self.landmarks.held.get(&linked.keyframe_id);
-        let of_key = held.and_then(|held| held.covariance.as_ref());
+        let of_key = self
+            .keyframe(linked.keyframe_id)
+            .and_then(|(_, of_key)| of_key);
         carried(of_key, &linked.key_from_cam.inverse())
     }
 
@@ -370,12 +437,11 @@ impl Localizer<'_> {
 }
 
 /// Standard deviation of the inliers' pixels across where they spread most.
-fn spread(fit: &Fit, pairs: &Pairs) -> f64 {
-    let pixels = || fit.inliers.iter().map(|i| pairs.observations[*i].pixel);
-    let n = fit.inliers.len().max(1) as f64;
-    let mean = pixels().sum::<glam::DVec2>() / n;
+fn spread(pixels: &[DVec2]) -> f64 {
+    let n = pixels.len().max(1) as f64;
+    let mean = pixels.iter().sum::<DVec2>() / n;
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for off in pixels().map(|pixel| pixel - mean) {
+    for off in pixels.iter().map(|pixel| *pixel - mean) {
         xx += off.x * off.x / n;
         xy += off.x * off.y / n;
         yy += off.y * off.y / n;

@@ -1,5 +1,6 @@
 //! Visual odometry, and what its poses are in the map: by the newest keyframe, or before there is one.
 
+use crate::track::align::AlignmentFrame;
 use crate::track::landmarks::KeyframeView;
 use crate::track::odometry_link::{LinkedKeyframe, LinkedMotion, LinkedPose, OdometryLink};
 use crate::visual_odometry::odometry::{OdometryPose, VisualOdometry};
@@ -60,6 +61,14 @@ impl MapOdometry {
             before_map: BeforeMap::Initialised,
             ..self
         }
+    }
+
+    /// The newest frame, and its camera as the map has refined it.
+    pub(crate) fn newest(&self) -> Option<AlignmentFrame<'_>> {
+        let pyramid = self.odometry.as_ref()?.newest_image()?;
+        let (width, height) = pyramid.image().size();
+        let camera = self.camera?.refined.resized((width as u32, height as u32));
+        Some(AlignmentFrame { pyramid, camera })
     }
 
     /// Odometry of one more frame.

@@ -10,6 +10,12 @@ mod observation;
 
 pub mod landmarks;
 
+mod patches;
+
+mod map_points;
+
+mod align;
+
 mod matching;
 
 mod landmark_file;

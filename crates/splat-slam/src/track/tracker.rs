@@ -3,6 +3,7 @@
 //! Corners of the frame are paired with landmarks of keyframes, near where the motion so far predicts them, or by their
 //! bits alone where there is no motion to go by. Reads copies of what the map knows; reports the map nothing.
 
+mod finding;
 mod reported;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -14,8 +15,9 @@ use crate::track::anchor::Anchor;
 use crate::track::history::{FrameTrack, History, Tracks};
 use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
 use crate::track::landmarks::{KeyframeView, Landmarks};
-use crate::track::localize::{Hint, Localized, Localizer, transported};
+use crate::track::localize::{Localized, Localizer, transported};
 use crate::track::map_odometry::MapOdometry;
+use crate::track::map_points::MapPoints;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
 use crate::track::odometry_link::LinkedPose;
@@ -25,7 +27,7 @@ use splat_types::covariance::Covariance;
 use splat_types::frame::Frame;
 use splat_types::image::RgbImage;
 use splat_types::time::Stamp;
-use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
+use splat_types::tracking::{TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
 
 /// Design effect before one was seen, and the share that each frame has in the mean: some 50 frames.
@@ -59,7 +61,7 @@ struct FoundFrame {
 }
 
 /// Which frames were looked for among the landmarks.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Search {
     last: Option<Stamp>,
     /// The last frame whose pose is by landmarks.
@@ -68,12 +70,28 @@ struct Search {
     n_failed: usize,
     /// Keyframe from which the search for a frame that the motion does not lead to goes on.
     next: usize,
+    /// Mean design effect of the frames that were found.
+    design: f64,
 }
 
+impl Default for Search {
+    fn default() -> Self {
+        Self {
+            last: None,
+            found: None,
+            n_failed: 0,
+            next: 0,
+            design: FIRST_DESIGN,
+        }
+    }
+}
+
+/// Frames in, poses out. Many methods: each way to find a frame, and what is said of it, looks at the same records.
 #[derive(Debug)]
 pub struct Tracker {
     params: TrackParams,
     landmarks: Landmarks,
+    points: MapPoints,
     /// Pose of every keyframe of the map, and the unit of its depths.
     keyframes: BTreeMap<u32, (Rigid, f64)>,
     state: TrackState,
@@ -84,7 +102,6 @@ pub struct Tracker {
     search: Search,
     /// The frame before.
     last: Option<(Stamp, Arc<RgbImage>)>,
-    design: f64,
     /// Frames that get a second look when the map has reached them.
     waiting: VecDeque<Waiting>,
     history: History,
@@ -95,6 +112,7 @@ impl Tracker {
         Self {
             params: params.clone(),
             landmarks: Landmarks::default(),
+            points: MapPoints::default(),
             keyframes: BTreeMap::new(),
             state: TrackState::Initialising,
             motion: None,
@@ -102,7 +120,6 @@ impl Tracker {
             odometry: MapOdometry::new(params.odometry),
             search: Search::default(),
             last: None,
-            design: FIRST_DESIGN,
             waiting: VecDeque::new(),
             history: History::default(),
         }
@@ -155,6 +172,11 @@ impl Tracker {
     fn look_at(&mut self, frame: &Frame) -> TrackedFrame {
         let odometry = self.odometry.follow(frame);
         let linked = self.linked(frame.seq);
+        if let Some(found) = self.found_by_points(frame, linked.as_ref()) {
+            let tracked = self.found((frame.seq, frame.stamp), &found);
+            self.keep(None, &tracked, None);
+            return tracked;
+        }
         if let Some((linked, pose)) = &linked
             && !self.is_match_due(frame.stamp)
         {
@@ -164,19 +186,20 @@ impl Tracker {
         }
         self.search.last = Some(frame.stamp);
         let seen = Arc::new(Observation::of(frame, &self.params));
+        let at = (seen.seq, seen.stamp);
         let guess = linked.as_ref().map(|(_, pose)| pose.inverse());
-        let tracked = match (self.find(&seen, guess), linked) {
-            (Ok((located, by_search)), linked) => match linked {
-                Some((linked, pose)) if self.is_surer(&linked, &located) => {
-                    self.carried((seen.seq, seen.stamp), &linked, &pose)
-                }
-                _ => self.found(&seen, &located, by_search),
-            },
-            (Err(_), Some((linked, pose))) => self.carried((seen.seq, seen.stamp), &linked, &pose),
+        let tracked = match (self.found_by_corners(&seen, guess), linked) {
+            (Ok(found), Some((linked, pose)))
+                if found.points.is_none() && self.is_surer(&linked, &found.located) =>
+            {
+                self.carried(at, &linked, &pose)
+            }
+            (Ok(found), _) => self.found(at, &found),
+            (Err(_), Some((linked, pose))) => self.carried(at, &linked, &pose),
             (Err(reason), None) => {
                 match odometry.filter(|pose| self.odometry.reports_before_map(pose)) {
                     Some(pose) => return self.ahead_of_map(seen, &pose),
-                    None => self.missed((seen.seq, seen.stamp), reason),
+                    None => self.missed(at, reason),
                 }
             }
         };
@@ -237,6 +260,7 @@ impl Tracker {
             .collect();
         let seen_before = |seq: u64| kept.get(&seq).map(|seen| Arc::clone(seen));
         self.landmarks.update(views, &seen_before, &self.params);
+        self.points.update(views);
         self.keyframes = views
             .iter()
             .map(|view| {
@@ -251,6 +275,7 @@ impl Tracker {
         }
         let after = self.anchor.and_then(|anchor| self.pose_by(&anchor));
         let unit = unit_at(self.anchor, &self.keyframes);
+        self.move_last_points();
         match (before.zip(after), self.motion.as_mut()) {
             (Some((before, after)), Some(motion)) => {
                 let unit = unit.zip(old_unit).map_or(1.0, |(new, old)| new / old);
@@ -415,32 +440,25 @@ impl Tracker {
     fn localizer(&self) -> Localizer<'_> {
         Localizer {
             landmarks: &self.landmarks,
+            points: &self.points,
             params: &self.params,
-            design: self.design,
+            design: self.search.design,
+            share_needed: 1.0,
         }
     }
 
-    /// The pose of the newest frame, and whether it was searched for without a hint.
-    /// `guess` is `cam_from_world` by odometry.
-    fn find(
-        &mut self,
-        seen: &Observation,
-        guess: Option<Rigid>,
-    ) -> Result<(Localized, bool), LostReason> {
-        let (n, start) = (self.landmarks.held.len().max(1), self.search.next);
-        let hint = Hint {
-            motion: self.motion.as_ref(),
-            guess,
-            is_lost: self.state == TrackState::Lost,
-            n_failed: self.search.n_failed,
-            scene_depth: self.scene_depth(),
-            last_keyframe: self.anchor.map(|anchor| anchor.keyframe_id),
-        };
-        let (found, has_searched) = self.localizer().find(seen, &hint, start);
-        if has_searched {
-            self.search.next = (start + self.params.relocalise_keyframes) % n;
+    /// The map has moved, and the frame that was found last with it.
+    fn move_last_points(&mut self) {
+        let found = self.search.found.as_ref();
+        let pose = found.and_then(|found| {
+            // In another unit its points lie elsewhere.
+            let unit = self.keyframes.get(&found.anchor.keyframe_id)?.1;
+            (unit == found.anchor.unit).then(|| self.pose_by(&found.anchor))?
+        });
+        match (pose, self.points.last.as_mut()) {
+            (Some(pose), Some(last)) => last.world_from_cam = pose,
+            _ => self.points.last = None,
         }
-        found
     }
 
     fn anchor_of(&self, located: &Localized) -> Anchor {

@@ -3,8 +3,11 @@
 use std::collections::BTreeSet;
 
 use crate::select::grey::GreyImage;
+use crate::select::image_shift::{image_shift, small};
 use crate::select::motion::corners_in_cells;
-use crate::select::optical_flow::{Found, Pyramid, optical_flow_far, optical_flow_near};
+use crate::select::optical_flow::{
+    Found, Pyramid, optical_flow_far, optical_flow_near, optical_flow_shifted,
+};
 
 /// Cells of an image, about; each has one new corner where it has none.
 const N_CELLS: usize = 500;
@@ -41,6 +44,10 @@ pub(crate) struct FeatureTracks {
 }
 
 impl FeatureTracks {
+    pub(crate) fn newest_image(&self) -> Option<&Pyramid> {
+        self.newest.as_ref()
+    }
+
     /// Follows all corners into the next image; `expected` says where one may be. An image of another size loses all.
     pub(crate) fn follow(
         &mut self,
@@ -72,14 +79,25 @@ impl FeatureTracks {
             // The camera has not gone on as it went: all are looked for from where they were, by what is coarse, for far
             // motion, and by what is fine, since repeated patterns mislead where they are small; then farther than windows reach.
             let places: Vec<[f32; 2]> = points.iter().map(|(at, _)| *at).collect();
-            let anywhere: Vec<_> = places.iter().map(|at| (*at, None)).collect();
-            let at_rest: Vec<_> = places.iter().map(|at| (*at, Some(*at))).collect();
-            if points.iter().any(|(_, expected)| expected.is_some()) {
-                keep_better(&mut found, optical_flow_near(&last, &next, &anywhere));
+            let shift = image_shift(&small(last.coarsest()), &small(next.coarsest()));
+            if let Some([x, y]) = shift {
+                let (width, height) = next.image().size();
+                let shift = [x as f32 * width as f32, y as f32 * height as f32];
+                keep_better(
+                    &mut found,
+                    optical_flow_shifted(&last, &next, &places, shift),
+                );
             }
-            keep_better(&mut found, optical_flow_near(&last, &next, &at_rest));
             if !is_enough(&found) {
-                keep_better(&mut found, optical_flow_far(&last, &next, &places));
+                let anywhere: Vec<_> = places.iter().map(|at| (*at, None)).collect();
+                let at_rest: Vec<_> = places.iter().map(|at| (*at, Some(*at))).collect();
+                if points.iter().any(|(_, expected)| expected.is_some()) {
+                    keep_better(&mut found, optical_flow_near(&last, &next, &anywhere));
+                }
+                keep_better(&mut found, optical_flow_near(&last, &next, &at_rest));
+                if !is_enough(&found) {
+                    keep_better(&mut found, optical_flow_far(&last, &next, &places));
+                }
             }
         }
         let followed = self.tracks.iter().zip(found);

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec2;
 
 use crate::select::motion::grey_of_size;
+use crate::select::optical_flow::Pyramid;
 use crate::visual_odometry::feature_tracks::FeatureTracks;
 use crate::visual_odometry::local_map::LocalMap;
 use crate::visual_odometry::two_view_start::{NoStart, start};
@@ -15,7 +16,7 @@ use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
 /// Pixels of the image that corners are followed on: 640x480, and a wide image of a car's camera, are not shrunk.
-const MAX_PX: usize = 500_000;
+pub(crate) const MAX_PX: usize = 500_000;
 /// A segment ends when no frame has had a pose for so long.
 const MAX_LOST_SECS: f64 = 0.5;
 /// While a segment is to begin, its first image is replaced when so few of its corners are left.
@@ -106,6 +107,11 @@ impl Default for VisualOdometry {
 }
 
 impl VisualOdometry {
+    /// The newest image and its halvings.
+    pub(crate) fn newest_image(&self) -> Option<&Pyramid> {
+        self.tracks.newest_image()
+    }
+
     /// `camera`: that of the frame, for images of any size; a frame without one was taken by the last one.
     pub fn push(&mut self, frame: &Frame, camera: Option<&WorkingCamera>) -> OdometryFrame {
         let grey = grey_of_size(&frame.image, MAX_PX);

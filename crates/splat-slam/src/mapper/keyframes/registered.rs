@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::keyframes::training_image::rescaled;
+use crate::track::landmarks::TriangulatedLandmarks;
 use splat_geometry::answer::PoseQuality;
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::depth::DepthMap;
@@ -18,6 +19,8 @@ pub struct DepthFit {
     pub factor: f64,
     /// How often the map was asked.
     pub n_looks: u8,
+    /// Median of the depth, in map units.
+    pub median: Option<f32>,
     /// Logarithms of metres per unit of the model's depth, by depth images and by the floor; `None` before it was
     /// looked at.
     pub log_metres: Option<[Option<f64>; 2]>,
@@ -28,6 +31,7 @@ impl Default for DepthFit {
         Self {
             factor: 1.0,
             n_looks: 0,
+            median: None,
             log_metres: None,
         }
     }
@@ -46,9 +50,9 @@ pub struct RegisteredKeyframe {
     pub intrinsics: Intrinsics,
     /// Of the keyframe's own image, where that had to be undistorted.
     pub lens: Option<CameraModel>,
-    /// In map units, and its median.
+    /// In map units.
     pub depth: Arc<DepthMap>,
-    pub median_depth: Option<f32>,
+    pub landmarks: TriangulatedLandmarks,
     pub depth_fit: DepthFit,
     pub health: PoseQuality,
     /// Kept out of optimisation, measures quality.
@@ -60,7 +64,11 @@ impl RegisteredKeyframe {
     /// The world has another unit: lengths are so many times as long in it.
     pub(crate) fn rescale(&mut self, factor: f64) {
         self.depth = Arc::new(rescaled(&self.depth, factor));
-        self.median_depth = self.median_depth.map(|d| (f64::from(d) * factor) as f32);
+        self.depth_fit.median = self
+            .depth_fit
+            .median
+            .map(|d| (f64::from(d) * factor) as f32);
+        self.landmarks.unit *= factor;
         if let Some(logs) = &mut self.depth_fit.log_metres {
             *logs = logs.map(|log| log.map(|log| log - factor.ln()));
         }

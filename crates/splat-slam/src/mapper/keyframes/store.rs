@@ -16,9 +16,10 @@ use crate::mapper::keyframes::training_image::training_image;
 use crate::mapper::metric_scale_params::ScaleParams;
 use crate::mapper::pages::Paging;
 use crate::mapper::params::MapperParams;
+use crate::track::landmarks::TriangulatedLandmarks;
 use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
-use splat_geometry::answer::View;
+use splat_geometry::answer::{Observations, View};
 use splat_geometry::similarity;
 use splat_types::depth::DepthMap;
 use splat_types::frame::Keyframe;
@@ -204,7 +205,7 @@ impl KeyframeStore {
     }
 
     pub(crate) fn measure_scene(&mut self) {
-        let medians = self.registered.values().filter_map(|p| p.median_depth);
+        let medians = self.registered.values().filter_map(|p| p.depth_fit.median);
         let mut medians: Vec<f32> = medians.collect();
         medians.sort_by(f32::total_cmp);
         if let Some(median) = medians.get(medians.len() / 2) {
@@ -460,10 +461,22 @@ impl KeyframeStore {
             registered.depth_fit.n_looks = 0;
         }
         engine.set_depth(registered.view_ix, Some(Arc::clone(&depth)))?;
-        (registered.median_depth, registered.depth) = (depth.median(), depth);
+        (registered.depth_fit.median, registered.depth) = (depth.median(), depth);
         registered.depth_fit.log_metres = None;
         registered.home.copy = None;
         Ok(is_first)
+    }
+
+    /// Takes over what the model has triangulated; `unit`: that of the map in one of its depths.
+    pub(crate) fn keep_landmarks(&mut self, observations: &[Observations], unit: f64) {
+        for seen in observations {
+            if let Some(registered) = self.registered.get_mut(&seen.keyframe_id) {
+                registered.landmarks = TriangulatedLandmarks {
+                    seen: seen.landmarks.as_slice().into(),
+                    unit,
+                };
+            }
+        }
     }
 
     /// Whether every keyframe has its image in memory.

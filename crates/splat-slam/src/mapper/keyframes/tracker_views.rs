@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::mapper::cameras::Cameras;
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
-use crate::track::landmarks::KeyframeView;
+use crate::track::landmarks::{KeyframeView, TriangulatedLandmarks};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
 
@@ -30,6 +30,11 @@ pub(crate) fn views_of(keyframes: &KeyframeStore, cameras: &Cameras) -> Vec<Keyf
                 &registered.depth
             },
         ),
+        landmarks: if registered.is_held_out {
+            TriangulatedLandmarks::none()
+        } else {
+            registered.landmarks.clone()
+        },
         covariance: registered.health.rescaled(unit).covariance.or(stated),
     };
     keyframes.registered().values().map(view).collect()

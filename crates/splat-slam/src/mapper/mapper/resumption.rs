@@ -9,6 +9,7 @@ use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::map_file::checkpoint::Checkpoint;
 use crate::mapper::mapper::Mapper;
 use crate::mapper::submaps::prior_map::{PriorMap, SAVED};
+use crate::track::landmarks::TriangulatedLandmarks;
 use crate::track::params::TrackParams;
 use crate::track::tracker::Tracker;
 use splat_engine::error::EngineError;
@@ -150,10 +151,11 @@ impl Mapper {
             intrinsics: k,
             lens: None,
             depth: Arc::new(DepthMap::none()),
-            median_depth: None,
+            landmarks: TriangulatedLandmarks::none(),
             depth_fit: DepthFit {
                 factor: 1.0,
                 n_looks: u8::MAX,
+                median: None,
                 log_metres: Some([None; 2]),
             },
             health: PoseQuality::default(),
@@ -219,7 +221,7 @@ impl Mapper {
             depths.retain(|z| *z > 0.0);
             depths.sort_by(f32::total_cmp);
             if let Some(registered) = self.keyframes.get_mut(anchor) {
-                registered.median_depth = depths.get(depths.len() / 2).copied();
+                registered.depth_fit.median = depths.get(depths.len() / 2).copied();
             }
         }
         Ok(())

@@ -55,7 +55,8 @@ pub(crate) fn revise(
     let is_rescaled = (scale - 1.0).abs() > f64::EPSILON;
     if is_rescaled {
         let depth = Arc::new(rescaled(&registered.depth, scale));
-        registered.median_depth = depth.median();
+        registered.depth_fit.median = depth.median();
+        registered.landmarks.unit *= scale;
         registered.depth_fit.log_metres = None;
         registered.depth = depth;
     }

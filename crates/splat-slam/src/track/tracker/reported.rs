@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use nalgebra::Matrix6;
 
+use super::finding::FoundPose;
 use super::{DESIGN_SHARE, FoundFrame, LOOK_AHEAD, MAX_DESIGN, Tracker, rows};
 use crate::track::anchor::Anchor;
-use crate::track::localize::Localized;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
 use crate::track::odometry_link::LinkedPose;
@@ -16,20 +16,16 @@ use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
 use splat_types::transform::Rigid;
 
 impl Tracker {
-    pub(super) fn found(
-        &mut self,
-        seen: &Observation,
-        located: &Localized,
-        by_search: bool,
-    ) -> TrackedFrame {
+    pub(super) fn found(&mut self, (seq, stamp): (u64, Stamp), found: &FoundPose) -> TrackedFrame {
+        let located = &found.located;
         let design = located.design.clamp(0.0, MAX_DESIGN);
-        self.design += DESIGN_SHARE * (design - self.design);
+        self.search.design += DESIGN_SHARE * (design - self.search.design);
         let covariance = self.localizer().covariance(located);
         let cam_from_world = located.cam_from_world;
-        let has_jumped = by_search
+        let has_jumped = found.by_search
             && self.motion.as_ref().is_some_and(|motion| {
                 self.state == TrackState::Lost
-                    || motion.is_elsewhere(seen.stamp, &cam_from_world, self.scene_depth())
+                    || motion.is_elsewhere(stamp, &cam_from_world, self.scene_depth())
             });
         // A jump that was noticed at once was a loss all the same.
         if has_jumped && self.state != TrackState::Lost {
@@ -41,12 +37,21 @@ impl Tracker {
         let is_new = was_elsewhere || self.state == TrackState::Lost;
         let anchor = self.anchor_of(located);
         self.search.found = Some(FoundFrame {
-            seq: seen.seq,
+            seq,
             anchor,
             covariance,
         });
+        let points = found.points.as_deref().zip(self.odometry.newest());
+        if let Some((points, frame)) = points {
+            let points = points.iter().map(|p| (p.id, p.point_in_world, p.pixel));
+            let image = (frame.pyramid, frame.camera);
+            let at = (located.reference, &cam_from_world);
+            self.points.keep_last(image, at, points);
+        } else {
+            self.points.last = None;
+        }
         let pose = (cam_from_world, covariance, located.n_inliers);
-        self.measured((seen.seq, seen.stamp), pose, anchor, has_jumped || is_new)
+        self.measured((seq, stamp), pose, anchor, has_jumped || is_new)
     }
 
     /// There is no map yet: the pose is in odometry's frame and unit.
