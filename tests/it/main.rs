@@ -5,6 +5,7 @@
 )]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+mod aligned_tracking;
 mod alignment;
 mod bags;
 mod budgets;
