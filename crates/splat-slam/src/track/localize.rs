@@ -5,6 +5,7 @@ use glam::{DVec2, DVec3};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
 use crate::track::align::{AlignedPoint, AlignmentFrame};
+use crate::track::keyframe_poses::Revisions;
 use crate::track::landmarks::{Landmarks, StoredKeyframe};
 use crate::track::map_points::{MapPoints, PointKeyframe};
 use crate::track::matching::{Pairs, guided, unguided};
@@ -14,7 +15,6 @@ use crate::track::odometry_link::LinkedPose;
 use crate::track::params::TrackParams;
 use crate::track::pose_fit::{self, Fit};
 use crate::working_camera::WorkingCamera;
-use splat_types::covariance::Covariance;
 use splat_types::tracking::LostReason;
 use splat_types::transform::{Rigid, skew};
 
@@ -88,6 +88,7 @@ pub(crate) struct Hint<'a> {
 pub(crate) struct Localizer<'a> {
     pub(crate) landmarks: &'a Landmarks,
     pub(crate) points: &'a MapPoints,
+    pub(crate) revisions: &'a Revisions,
     pub(crate) params: &'a TrackParams,
     /// Design effect of the frames so far.
     pub(crate) design: f64,
@@ -380,25 +381,32 @@ impl Localizer<'_> {
         let away = Vector3::new(away.x, away.y, away.z);
         let mut place = covariance.fixed_view_mut::<3, 3>(0, 0);
         place += away * away.transpose();
-        covariance + carried(of_key, &cam_from_key)
+        covariance
+            + of_key.map_or_else(Matrix6::zeros, |of_key| transported(&of_key, &cam_from_key))
     }
 
-    /// Where a keyframe stands, and its covariance where that is known.
-    fn keyframe(&self, id: u32) -> Option<(Rigid, Option<&Covariance>)> {
-        let held = self.landmarks.held.get(&id);
-        let held = held.map(|held| (held.world_from_cam, held.covariance.as_ref()));
-        held.or_else(|| {
-            let held = self.points.held.get(&id)?;
-            Some((held.world_from_cam, held.covariance.as_ref()))
-        })
+    /// Where a keyframe stands, and where the geometry states its covariance, that and what the map will yet move it by.
+    fn keyframe(&self, id: u32) -> Option<(Rigid, Option<Matrix6<f64>>)> {
+        let (by_points, by_corners) = (self.points.held.get(&id), self.landmarks.held.get(&id));
+        let by_points =
+            by_points.map(|held| (held.world_from_cam, held.covariance, held.median_depth()));
+        let (world_from_cam, stated, depth) = by_points.or_else(|| {
+            by_corners.map(|held| (held.world_from_cam, held.covariance, held.median_depth()))
+        })?;
+        let stated = stated.map(|stated| {
+            let stated = Matrix6::from_fn(|i, j| stated[i][j]);
+            stated + self.revisions.covariance(id, depth)
+        });
+        Some((world_from_cam, stated))
     }
 
     /// What the keyframe's own covariance is worth at a camera that odometry has led away from it.
     pub(crate) fn covariance_of_key(&self, linked: &LinkedPose) -> Matrix6<f64> {
-        let of_key = self
-            .keyframe(linked.keyframe_id)
-            .and_then(|(_, of_key)| of_key);
-        carried(of_key, &linked.key_from_cam.inverse())
+        let of_key = self.keyframe(linked.keyframe_id);
+        let of_key = of_key.and_then(|(_, of_key)| of_key);
+        of_key.map_or_else(Matrix6::zeros, |of_key| {
+            transported(&of_key, &linked.key_from_cam.inverse())
+        })
     }
 
     /// Keyframes that a search compares a frame with: the newest ones and the last one tracked by, the most alike, and
@@ -459,13 +467,6 @@ fn most_frequent(ids: impl Iterator<Item = u32>) -> u32 {
     }
     let most = counts.into_iter().max_by_key(|(id, n)| (*n, *id));
     most.map_or(0, |(id, _)| id)
-}
-
-/// A keyframe's covariance in the axes of a camera beside it; zero where it is not known.
-fn carried(of_key: Option<&Covariance>, cam_from_key: &Rigid) -> Matrix6<f64> {
-    of_key.map_or_else(Matrix6::zeros, |of_key| {
-        transported(&Matrix6::from_fn(|i, j| of_key[i][j]), cam_from_key)
-    })
 }
 
 /// The covariance of one camera in the axes of another that is rigidly beside it.

@@ -16,6 +16,8 @@ mod map_points;
 
 mod align;
 
+mod keyframe_poses;
+
 mod matching;
 
 mod landmark_file;

@@ -13,6 +13,7 @@ use nalgebra::Matrix6;
 
 use crate::track::anchor::Anchor;
 use crate::track::history::{FrameTrack, History, Tracks};
+use crate::track::keyframe_poses::KeyframePoses;
 use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
 use crate::track::landmarks::{KeyframeView, Landmarks};
 use crate::track::localize::{Localized, Localizer, transported};
@@ -93,7 +94,7 @@ pub struct Tracker {
     landmarks: Landmarks,
     points: MapPoints,
     /// Pose of every keyframe of the map, and the unit of its depths.
-    keyframes: BTreeMap<u32, (Rigid, f64)>,
+    keyframes: KeyframePoses,
     state: TrackState,
     motion: Option<Motion>,
     /// Of the last measured pose.
@@ -113,7 +114,7 @@ impl Tracker {
             params: params.clone(),
             landmarks: Landmarks::default(),
             points: MapPoints::default(),
-            keyframes: BTreeMap::new(),
+            keyframes: KeyframePoses::default(),
             state: TrackState::Initialising,
             motion: None,
             anchor: None,
@@ -261,15 +262,13 @@ impl Tracker {
         let seen_before = |seq: u64| kept.get(&seq).map(|seen| Arc::clone(seen));
         self.landmarks.update(views, &seen_before, &self.params);
         self.points.update(views);
-        self.keyframes = views
-            .iter()
-            .map(|view| {
-                let id = view.keyframe.id;
-                let held = self.landmarks.held.get(&id).map(|held| held.unit);
-                let unit = held.or(self.keyframes.get(&id).map(|(_, unit)| *unit));
-                (id, (view.world_from_cam, unit.unwrap_or(1.0)))
-            })
-            .collect();
+        let poses = views.iter().map(|view| {
+            let id = view.keyframe.id;
+            let held = self.landmarks.held.get(&id).map(|held| held.unit);
+            let unit = held.or(self.keyframes.get(&id).map(|(_, unit)| *unit));
+            (id, (view.world_from_cam, unit.unwrap_or(1.0)))
+        });
+        self.keyframes.update(poses.collect());
         if let Some(initialisation) = self.odometry.update(views) {
             self.history.express_in_map(&initialisation);
         }
@@ -441,6 +440,7 @@ impl Tracker {
         Localizer {
             landmarks: &self.landmarks,
             points: &self.points,
+            revisions: &self.keyframes.revisions,
             params: &self.params,
             design: self.search.design,
             share_needed: 1.0,
@@ -498,7 +498,7 @@ fn repeats(last: Option<&(Stamp, Arc<RgbImage>)>, frame: &Frame) -> bool {
 }
 
 /// Length of the map's unit at the keyframe that a pose hangs on.
-fn unit_at(anchor: Option<Anchor>, keyframes: &BTreeMap<u32, (Rigid, f64)>) -> Option<f64> {
+fn unit_at(anchor: Option<Anchor>, keyframes: &KeyframePoses) -> Option<f64> {
     keyframes.get(&anchor?.keyframe_id).map(|(_, unit)| *unit)
 }
 
