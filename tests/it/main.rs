@@ -50,6 +50,7 @@ mod pose_anchor;
 mod provisional_splats;
 
 mod publish;
+mod real_poses;
 mod recordings;
 mod relocation;
 mod render_poses;

@@ -6,6 +6,8 @@ use crate::select::grey::GreyImage;
 const SIDE_PX: usize = 60;
 /// Share of the image that must be in both.
 const MIN_OVERLAP: f64 = 0.35;
+/// Shifts at half the size that are looked at again.
+const N_REFINED: usize = 4;
 /// Least correlation of what is in both.
 const MIN_CORRELATION: f32 = 0.3;
 
@@ -24,27 +26,31 @@ pub(crate) fn image_shift(from: &GreyImage, to: &GreyImage) -> Option<[f64; 2]> 
     if from.size() != to.size() {
         return None;
     }
-    let (width, height) = (from.width as i64, from.height as i64);
-    let mut best: Option<([i64; 2], f32)> = None;
-    for dy in 1 - height..height {
-        for dx in 1 - width..width {
-            let overlap = (width - dx.abs()) * (height - dy.abs());
-            if (overlap as f64) < MIN_OVERLAP * (width * height) as f64 {
-                continue;
-            }
-            let score = correlation(from, to, [dx, dy]);
-            if best.is_none_or(|(_, other)| score > other) {
-                best = Some(([dx, dy], score));
-            }
-        }
-    }
-    let ([dx, dy], score) = best?;
-    let share = |d: i64, side: i64| d as f64 / side as f64;
-    (score >= MIN_CORRELATION).then(|| [share(dx, width), share(dy, height)])
+    // All shifts at half the size, then those around the best ones.
+    let (small_from, small_to) = (from.halved(), to.halved());
+    let (width, height) = (small_from.width as i64, small_from.height as i64);
+    let all = (1 - height..height).flat_map(|dy| (1 - width..width).map(move |dx| [dx, dy]));
+    let score = |shift: [i64; 2]| Some((shift, correlation(&small_from, &small_to, shift)?));
+    let mut coarse: Vec<([i64; 2], f32)> = all.filter_map(score).collect();
+    coarse.sort_by(|a, b| b.1.total_cmp(&a.1));
+    coarse.truncate(N_REFINED);
+    let near = coarse.iter().flat_map(|([dx, dy], _)| {
+        let (dx, dy) = (2 * dx, 2 * dy);
+        (-1..=1).flat_map(move |y| (-1..=1).map(move |x| [dx + x, dy + y]))
+    });
+    let fine = near.filter_map(|shift| Some((shift, correlation(from, to, shift)?)));
+    let ([dx, dy], score) = fine.max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let share = |d: i64, side: usize| d as f64 / side as f64;
+    (score >= MIN_CORRELATION).then(|| [share(dx, from.width), share(dy, from.height)])
 }
 
-/// Of what is in both images when `from` is shifted.
-fn correlation(from: &GreyImage, to: &GreyImage, [dx, dy]: [i64; 2]) -> f32 {
+/// Of what is in both images when `from` is shifted; `None`: too little.
+fn correlation(from: &GreyImage, to: &GreyImage, [dx, dy]: [i64; 2]) -> Option<f32> {
+    let left = |d: i64, side: usize| (side as i64 - d.abs()).max(0);
+    let overlap = left(dx, from.width) * left(dy, from.height);
+    if (overlap as f64) < MIN_OVERLAP * (from.width * from.height) as f64 {
+        return None;
+    }
     let span = |d: i64, side: usize| {
         let first = (-d).max(0) as usize;
         first..first + side - d.unsigned_abs() as usize
@@ -64,11 +70,11 @@ fn correlation(from: &GreyImage, to: &GreyImage, [dx, dy]: [i64; 2]) -> f32 {
         }
     }
     let squares = (aa - a * a / n) * (bb - b * b / n);
-    if squares > 0.0 {
+    Some(if squares > 0.0 {
         (ab - a * b / n) / squares.sqrt()
     } else {
         0.0
-    }
+    })
 }
 
 #[cfg(test)]

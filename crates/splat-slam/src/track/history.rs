@@ -2,6 +2,7 @@
 
 use crate::track::anchor::Anchor;
 use crate::track::map_odometry::MapInitialisation;
+use crate::track::odometry_link::MIN_UNIT_STD;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
@@ -115,10 +116,21 @@ impl History {
 
     /// Poses that were reported before there was a map go into its frame, where it is known how.
     pub(crate) fn express_in_map(&mut self, initialisation: &MapInitialisation) {
+        let is_of_segment = |entry: &&HistoryEntry| entry.segment == Some(initialisation.segment);
+        let newest = self.frames.iter().rev().find(is_of_segment);
+        let newest = newest.and_then(|entry| entry.track.live);
         for entry in &mut self.frames {
             if entry.segment.take() == Some(initialisation.segment) {
                 let map = initialisation.world_from_odometry;
                 let in_map = |pose: &Rigid| Some(map?.transform_pose(pose));
+                // The unit is that of the newest frames, and drifts on the way to them.
+                let ends = entry.track.live.zip(newest);
+                let away = ends.map_or(0.0, |(here, newest)| {
+                    (newest.translation - here.translation).length()
+                });
+                let scale = map.map_or(1.0, |map| map.scale);
+                let in_unit = |std: f32| (f64::from(std).hypot(MIN_UNIT_STD * away) * scale) as f32;
+                entry.track.std = entry.track.std.map(|(far, turned)| (in_unit(far), turned));
                 entry.track.live = entry.track.live.as_ref().and_then(in_map);
             }
         }

@@ -17,8 +17,8 @@ const SETTLED_SHARE: f64 = 0.6;
 /// Keyframes that the statistic is made of, the last ones that have settled.
 const N_KEYFRAMES: usize = 24;
 /// Taken for keyframes of the past while there are none: shares of the scene's depth, and radians.
-const N_PRIOR: usize = 4;
-const PRIOR_DEPTHS: f64 = 0.003;
+const N_PRIOR: usize = 8;
+const PRIOR_DEPTHS: f64 = 0.005;
 const PRIOR_RAD: f64 = 0.003;
 /// Share of the motions that are smaller than the one that the standard deviation is taken from, and so many of which that one is
 /// in a normal distribution: beyond the median, as few large ones matter, too.

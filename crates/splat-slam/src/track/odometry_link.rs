@@ -23,7 +23,7 @@ const MIN_BASELINE_SHARE: f64 = 0.3;
 /// A unit by distances that scatter by more says nothing.
 const MAX_UNIT_STD: f64 = 0.3;
 /// Drift of visual odometry, as a share of the distance, where it has not been measured.
-const MIN_UNIT_STD: f64 = 0.02;
+pub(crate) const MIN_UNIT_STD: f64 = 0.02;
 /// The same for what it has turned wrongly: radians per axis, for each radian turned and each median depth gone.
 const MIN_TURN_DRIFT: f64 = 0.01;
 

@@ -236,7 +236,8 @@ fn corner_of(shown: DVec2, level_ix: usize) -> [i64; 2] {
 /// A warped patch, its derivatives and the inverse of their normal matrix.
 struct Template {
     values: [f32; SIDE * SIDE],
-    slopes: [[f32; 2]; SIDE * SIDE],
+    /// To the right, and down.
+    slopes: [[f32; SIDE * SIDE]; 2],
     inverse: Matrix3<f32>,
 }
 
@@ -249,13 +250,13 @@ impl Template {
             let (x, y) = inner(i);
             at(x, y)
         });
-        let slopes: [[f32; 2]; SIDE * SIDE] = std::array::from_fn(|i| {
-            let (x, y) = inner(i);
-            [
-                0.5 * (at(x + 1, y) - at(x - 1, y)),
-                0.5 * (at(x, y + 1) - at(x, y - 1)),
-            ]
-        });
+        let slope = |(dx, dy): (usize, usize)| -> [f32; SIDE * SIDE] {
+            std::array::from_fn(|i| {
+                let (x, y) = inner(i);
+                0.5 * (at(x + dx, y + dy) - at(x - dx, y - dy))
+            })
+        };
+        let slopes = [slope((1, 0)), slope((0, 1))];
         let n = values.len() as f32;
         let mean = values.iter().sum::<f32>() / n;
         let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n;
@@ -263,7 +264,7 @@ impl Template {
             return None;
         }
         let mut normal = Matrix3::<f32>::zeros();
-        for [gx, gy] in &slopes {
+        for (gx, gy) in slopes[0].iter().zip(&slopes[1]) {
             let j = Vector3::new(*gx, *gy, 1.0);
             normal += j * j.transpose();
         }
@@ -293,15 +294,17 @@ impl Template {
                 if !fits {
                     continue;
                 }
-                let (mut ab, mut b, mut bb) = (0.0, 0.0, 0.0);
+                let mut lanes = [[0.0; SIDE]; 3];
                 for (row, own) in own.chunks_exact(SIDE).enumerate() {
                     let from = (top as usize + row) * image.width + left as usize;
-                    for (own, other) in own.iter().zip(&image.values[from..from + SIDE]) {
-                        ab += own * other;
-                        b += other;
-                        bb += other * other;
+                    let other = &image.values[from..from + SIDE];
+                    for i in 0..SIDE {
+                        lanes[0][i] += own[i] * other[i];
+                        lanes[1][i] += other[i];
+                        lanes[2][i] += other[i] * other[i];
                     }
                 }
+                let [ab, b, bb] = lanes.map(|lanes| lanes.iter().sum::<f32>());
                 let squares = (bb - b * b / n) * own_squares;
                 let score = if squares > 0.0 {
                     ab / squares.sqrt()
@@ -326,11 +329,23 @@ impl Template {
         let mut shown = [0.0; SIDE * SIDE];
         for _ in 0..MAX_ITERATIONS {
             sample(image, at, &mut shown)?;
-            let mut descent = Vector3::zeros();
-            for ((own, other), [gx, gy]) in self.values.iter().zip(&shown).zip(&self.slopes) {
-                let off = own + offset - other;
-                descent += Vector3::new(gx * off, gy * off, off);
+            // One lane for each column, so that vector units make the sums.
+            let mut lanes = [[0.0; SIDE]; 3];
+            for row in 0..SIDE {
+                let at = row * SIDE;
+                let (own, other) = (&self.values[at..at + SIDE], &shown[at..at + SIDE]);
+                let (gx, gy) = (
+                    &self.slopes[0][at..at + SIDE],
+                    &self.slopes[1][at..at + SIDE],
+                );
+                for i in 0..SIDE {
+                    let off = own[i] + offset - other[i];
+                    lanes[0][i] += gx[i] * off;
+                    lanes[1][i] += gy[i] * off;
+                    lanes[2][i] += off;
+                }
             }
+            let descent = Vector3::from(lanes.map(|lanes| lanes.iter().sum::<f32>()));
             let step = self.inverse * descent;
             at = [at[0] + step.x, at[1] + step.y];
             offset -= step.z;
