@@ -39,6 +39,32 @@ impl WorkingCamera {
         }
     }
 
+    /// Whether another camera of images of the same size shows rays at the same pixels, but for a share of the longer side.
+    pub(crate) fn is_alike(&self, other: &Self, share: f64) -> bool {
+        if self == other {
+            return true;
+        }
+        let (own, others) = (&self.pinhole, &other.pinhole);
+        if (own.width_px, own.height_px) != (others.width_px, others.height_px) {
+            return false;
+        }
+        let size = DVec2::new(f64::from(own.width_px), f64::from(own.height_px));
+        let tolerance_px = share * size.max_element();
+        let places = [
+            (0.05, 0.05),
+            (0.95, 0.05),
+            (0.05, 0.95),
+            (0.95, 0.95),
+            (0.5, 0.5),
+        ];
+        places.into_iter().all(|(x, y)| {
+            let pixel = size * DVec2::new(x, y);
+            let apart = (own.ray_in_cam(pixel) - others.ray_in_cam(pixel)).length() * own.fx;
+            let shown = self.distorted(pixel).zip(other.distorted(pixel));
+            apart < tolerance_px && shown.is_some_and(|(a, b)| a.distance(b) < tolerance_px)
+        })
+    }
+
     /// Where the pinhole would show what the lens shows at a pixel; not a number where the lens says nothing.
     pub(crate) fn undistorted(&self, pixel: DVec2) -> DVec2 {
         let Some(lens) = &self.lens else {

@@ -24,6 +24,9 @@ const N_ASKED: usize = 24;
 const MIN_ANGLE_COSINE: f64 = 0.6;
 const MAX_ZOOM: f64 = 2.5;
 
+/// Landmarks are those of a camera whose pixels are off by less than this share of the longer side.
+pub(crate) const ALIKE: f64 = 3e-4;
+
 /// What the map says of one of its keyframes.
 #[derive(Debug, Clone)]
 pub struct KeyframeView {
@@ -88,6 +91,9 @@ pub(crate) struct Landmarks {
     aside: BTreeMap<u32, StoredKeyframe>,
     /// Of keyframes of the map whose depth is still to come; in order.
     bare: Vec<Stamp>,
+    /// Depth at which no corner lies. Corners take most of the time of a frame to find: they are not looked for again until there is
+    /// other depth.
+    barren: BTreeMap<u32, Weak<DepthMap>>,
 }
 
 /// Which frames have landmarks on both sides.
@@ -130,6 +136,7 @@ impl Landmarks {
         self.held = held;
         self.aside.extend::<BTreeMap<u32, StoredKeyframe>>(gone);
         self.bare.clear();
+        self.barren.retain(|id, _| ids.contains_key(id));
         for (id, view) in ids {
             let held = self.held.remove(&id).or_else(|| self.aside.remove(&id));
             let seen = match &held {
@@ -138,11 +145,18 @@ impl Landmarks {
                     self.bare.push(view.keyframe.frame.stamp);
                     continue;
                 }
+                None if self.is_barren(id, &view.depth) => continue,
                 None => seen_before(view.keyframe.frame.seq)
                     .unwrap_or_else(|| Arc::new(Observation::of(&view.keyframe.frame, params))),
             };
-            if let Some(held) = StoredKeyframe::new(view, seen, held, params) {
-                self.held.insert(id, held);
+            match StoredKeyframe::new(view, seen, held, params) {
+                Some(held) => {
+                    self.barren.remove(&id);
+                    self.held.insert(id, held);
+                }
+                None => {
+                    self.barren.insert(id, Arc::downgrade(&view.depth));
+                }
             }
         }
         while self.held.len() > params.max_keyframes {
@@ -152,6 +166,11 @@ impl Landmarks {
             self.aside.pop_first();
         }
         self.bare.sort_unstable();
+    }
+
+    fn is_barren(&self, id: u32, depth: &Arc<DepthMap>) -> bool {
+        let known = self.barren.get(&id);
+        known.is_some_and(|known| std::ptr::eq(known.as_ptr(), Arc::as_ptr(depth)))
     }
 
     pub(crate) fn reach(&self) -> Reach {
@@ -222,8 +241,10 @@ impl StoredKeyframe {
             depths: Vec::new(),
         };
         if let Some(before) = before {
-            let is_same = before.camera == camera && before.depth.ptr_eq(&held.depth);
-            if is_same || view.depth.width_px == 0 {
+            let is_alike = before.camera.is_alike(&camera, ALIKE);
+            if (is_alike && before.depth.ptr_eq(&held.depth)) || view.depth.width_px == 0 {
+                // Adjustment refines all focal lengths a little each time.
+                held.camera = before.camera;
                 (held.landmarks, held.depths) = (before.landmarks, before.depths);
                 return view.world_from_cam.is_finite().then_some(held);
             }

@@ -9,7 +9,7 @@ use crate::select::grey::GreyImage;
 use crate::select::image_shift::small;
 use crate::select::motion::grey_of_size;
 use crate::select::optical_flow::Pyramid;
-use crate::track::landmarks::{KeyframeView, TriangulatedLandmarks};
+use crate::track::landmarks::{ALIKE, KeyframeView, TriangulatedLandmarks};
 use crate::track::patches::{MapPoint, N_LEVELS};
 use crate::visual_odometry::odometry::MAX_PX;
 use crate::working_camera::WorkingCamera;
@@ -119,6 +119,7 @@ impl PointKeyframe {
             }
             None => Self::new(view)?,
         };
+        held.take_camera(view);
         let ratio = landmarks.unit / held.unit;
         if ratio != 1.0 {
             held.points.iter_mut().for_each(|p| p.point_in_key *= ratio);
@@ -157,6 +158,21 @@ impl PointKeyframe {
             source: Arc::downgrade(&view.landmarks.seen),
             unit,
         })
+    }
+
+    /// The focal length was refined, or the lens: the points lie on other rays.
+    fn take_camera(&mut self, view: &KeyframeView) {
+        let pinhole = &self.camera.pinhole;
+        let size = (pinhole.width_px, pinhole.height_px);
+        let camera = WorkingCamera::of(&view.intrinsics, view.lens.as_ref(), size);
+        let Some(camera) = camera.filter(|camera| !self.camera.is_alike(camera, ALIKE)) else {
+            return;
+        };
+        for point in &mut self.points {
+            let depth = point.point_in_key.z;
+            point.point_in_key = camera.pinhole.ray_in_cam(point.pixel) * depth;
+        }
+        self.camera = camera;
     }
 
     /// The model has triangulated again: what is known keeps its patches.
