@@ -224,6 +224,8 @@ impl Sfm {
             self.scene.views[view].failed_with = 0;
             link_alike(&mut self.scene, view, limits.max_error_px, self.seed);
         }
+        // What did not fit then may fit now that all is adjusted.
+        self.scene.unmerged.extend(0..self.scene.views.len());
         self.place_waiting(&waiting, &limits, 3);
         for submap in 0..self.scene.submaps.len() as u32 {
             adjust_global(&mut self.scene, submap, limits.max_error_px, 30);

@@ -90,11 +90,10 @@ fn ranked_pairs(
 ) -> (Vec<(f64, usize, usize)>, bool) {
     let mut pairs = Vec::new();
     let mut has_matches = false;
-    let keys: Vec<(usize, usize)> = scene.links.keys().copied().collect();
-    for (a, b) in keys
-        .into_iter()
-        .filter(|(a, b)| waiting.contains(a) && waiting.contains(b))
-    {
+    let of_first = |&a: &usize| scene.links.range((a, 0)..(a + 1, 0)).map(|link| *link.0);
+    let waits = |ends: &(usize, usize)| waiting.contains(&ends.1);
+    let keys: Vec<(usize, usize)> = waiting.iter().flat_map(of_first).filter(waits).collect();
+    for (a, b) in keys {
         let link = &scene.links[&(a, b)];
         let n = link.matches.len();
         if n < limits.min_inliers {

@@ -1,6 +1,6 @@
 //! Two submaps that see the same landmarks -> one, by the similarity that their landmarks agree on.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use rand::SeedableRng;
@@ -20,16 +20,38 @@ const TRIES: usize = 300;
 /// parts are of few keyframes a fourth of them agrees on a wrong place, too.
 const MIN_INLIERS: f64 = 0.5;
 
-/// Merges until nothing fits any more. The submap with the lower number stays.
+/// Merges the submaps that fit, of those that have come to share matches since the last call; again, until it answers
+/// `false`. The submap with the lower number stays.
 pub(crate) fn merge(scene: &mut Reconstruction, limits: &Limits) -> bool {
     let mut merged = false;
-    let n = scene.submaps.len() as u32;
-    for stays in 0..n {
-        for gone in stays + 1..n {
-            merged |= merge_pair(scene, stays, gone, limits);
-        }
+    for (stays, gone) in submaps_in_touch(scene) {
+        merged |= merge_pair(scene, stays, gone, limits);
     }
     merged
+}
+
+/// Submaps that a match of a view of `unmerged` leads to, in order; of all other pairs nothing has changed.
+fn submaps_in_touch(scene: &mut Reconstruction) -> BTreeSet<(u32, u32)> {
+    let mut pairs = BTreeSet::new();
+    for view_ix in std::mem::take(&mut scene.unmerged) {
+        let view = &scene.views[view_ix];
+        let Some(own) = scene.submap_of(view_ix) else {
+            continue;
+        };
+        let named = view.landmark_of.iter().zip(&view.matched);
+        let matched = named
+            .filter(|(landmark, _)| **landmark != NONE)
+            .flat_map(|(_, matched)| matched);
+        for &(other, feature) in matched {
+            let landmark = scene.views[other as usize].landmark_of[feature as usize];
+            if landmark != NONE {
+                let other = scene.landmarks[landmark as usize].submap;
+                pairs.insert((own.min(other), own.max(other)));
+            }
+        }
+    }
+    pairs.retain(|(a, b)| a != b);
+    pairs
 }
 
 fn merge_pair(scene: &mut Reconstruction, stays: u32, gone: u32, limits: &Limits) -> bool {
@@ -60,6 +82,7 @@ fn merge_pair(scene: &mut Reconstruction, stays: u32, gone: u32, limits: &Limits
             registered.submap = stays;
         }
     }
+    scene.unmerged.extend(&views);
     scene.submaps[stays as usize].views.extend(views);
     for ix in inliers {
         let (a, b) = pairs[ix];
@@ -94,8 +117,8 @@ fn common_landmarks(scene: &Reconstruction, a: u32, b: u32) -> Vec<(u32, u32)> {
     let mut ranked: Vec<((u32, u32), usize)> = votes.into_iter().collect();
     ranked.sort_by(|x, y| y.1.cmp(&x.1).then(x.0.cmp(&y.0)));
     let (mut taken_a, mut taken_b) = (
-        std::collections::BTreeSet::new(),
-        std::collections::BTreeSet::new(),
+        BTreeSet::new(),
+        BTreeSet::new(),
     );
     ranked.retain(|((l, m), _)| {
         !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m)

@@ -136,6 +136,7 @@ fn insert(scene: &mut Reconstruction, view_ix: usize, other: usize, link: PairMa
         scene.views[other].matched[theirs as usize].push((view_ix as u32, ours));
         scene.views[view_ix].matched[ours as usize].push((other as u32, theirs));
     }
+    scene.unmerged.extend([other, view_ix]);
     let flipped = other > view_ix;
     let link = if flipped { reversed(&link) } else { link };
     scene

@@ -2,7 +2,7 @@
 //!
 //! Only bookkeeping: every function here keeps `SfmView::landmark_of` and `Landmark::seen` in step.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
@@ -104,6 +104,8 @@ pub(crate) struct Reconstruction {
     /// The same when the matches were verified.
     pub(crate) linked_with: f64,
     pub(crate) undistorted: Undistorted,
+    /// Views that have got matches or landmarks since submaps were last merged.
+    pub(crate) unmerged: BTreeSet<usize>,
     /// Grows when a submap is adjusted as a whole, merged or dissolved, or a loop is closed.
     pub(crate) n_rebuilt: u64,
 }
@@ -214,6 +216,7 @@ impl Reconstruction {
         let ix = self.landmarks.len() as u32;
         for &(view, feature) in &seen {
             self.views[view as usize].landmark_of[feature as usize] = ix;
+            self.unmerged.insert(view as usize);
         }
         self.landmarks.push(Landmark {
             point,
@@ -231,6 +234,7 @@ impl Reconstruction {
         }
         landmark.seen.push(at);
         self.views[at.0 as usize].landmark_of[at.1 as usize] = landmark_ix;
+        self.unmerged.insert(at.0 as usize);
         true
     }
 

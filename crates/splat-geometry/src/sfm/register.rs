@@ -1,5 +1,7 @@
 //! Waiting views -> poses in a submap, best supported first; each one brings landmarks and a local adjustment.
 
+use std::collections::BTreeMap;
+
 use glam::{DVec2, DVec3};
 
 use crate::pnp;
@@ -116,18 +118,41 @@ fn best_waiting(scene: &Reconstruction, pool: &[usize], limits: &Limits) -> Opti
         .iter()
         .filter(|&&s| scene.views[s].registered.is_none())
     {
-        for submap in 0..scene.submaps.len() as u32 {
-            let pairs = correspondences(scene, view, submap);
-            let needed = limits
-                .min_inliers
-                .max(scene.views[view].failed_with * 6 / 5 + 1);
-            let is_better = best.as_ref().is_none_or(|b| pairs.len() > b.2.len());
-            if pairs.len() >= needed && is_better {
-                best = Some((view, submap, pairs));
-            }
+        let Some((submap, n)) = best_submap(scene, view) else {
+            continue;
+        };
+        let needed = limits
+            .min_inliers
+            .max(scene.views[view].failed_with * 6 / 5 + 1);
+        if n >= needed && best.as_ref().is_none_or(|b| n > b.2.len()) {
+            best = Some((view, submap, correspondences(scene, view, submap)));
         }
     }
     best
+}
+
+/// The submap in which most features of a view have landmarks by their matches, and their number.
+fn best_submap(scene: &Reconstruction, view_ix: usize) -> Option<(u32, usize)> {
+    let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
+    let mut named = Vec::new();
+    for matched in &scene.views[view_ix].matched {
+        let owners = matched
+            .iter()
+            .map(|&(s, f)| scene.views[s as usize].landmark_of[f as usize]);
+        named.clear();
+        named.extend(
+            owners
+                .filter(|&l| l != NONE)
+                .map(|l| scene.landmarks[l as usize].submap),
+        );
+        named.sort_unstable();
+        named.dedup();
+        for submap in &named {
+            *counts.entry(*submap).or_insert(0) += 1;
+        }
+    }
+    // Of as many in two, the older submap.
+    counts.into_iter().rev().max_by_key(|count| count.1)
 }
 
 fn pose(
