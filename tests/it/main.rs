@@ -64,6 +64,7 @@ mod sent_corrections;
 mod sent_submaps;
 mod sfm;
 mod sfm_batches;
+mod sfm_corridor;
 mod sfm_lenses;
 mod sfm_live;
 mod shader_layouts;

@@ -1,5 +1,7 @@
 //! Waiting views -> a new submap: the pair with most parallax, its landmarks, and all that can be registered on them.
 
+use glam::{DMat3, DVec3};
+
 use crate::sfm::adjust::{adjust_global, median_error_px};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
@@ -7,8 +9,10 @@ use crate::sfm::pairwise::{pair_seed, pixel_pairs};
 use crate::sfm::reconstruction::{NONE, Reconstruction, Submap};
 use crate::sfm::register::grow;
 use crate::stats::median;
-use crate::two_view::epipolar::{homography_share, motion};
+use crate::two_view::epipolar::{homography, homography_share, motion};
+use crate::two_view::plane::motions_by_plane;
 use crate::two_view::triangulate::widest_angle;
+use splat_types::camera::Intrinsics;
 use splat_types::transform::{Rigid, Similarity};
 
 /// Pairs that are tried before waiting for more keyframes.
@@ -17,6 +21,8 @@ const MAX_ATTEMPTS: usize = 5;
 const ENOUGH_PARALLAX_DEG: f64 = 12.0;
 /// Share of matches on one plane from which on a pair is a poor start: two motions explain it about equally well.
 const PLANE_SHARE: f64 = 0.85;
+/// Share from which on both motions are tried: the one that five points gave may be the plane's wrong one.
+const HALF_PLANE_SHARE: f64 = 0.5;
 
 /// A start that places this share of the waiting views is taken without trying other pairs.
 const GOOD_SHARE: f64 = 0.7;
@@ -59,22 +65,30 @@ pub(crate) fn start(
             Start::NoMatches
         };
     }
-    let mut best: Option<(usize, (usize, usize))> = None;
-    for (_, a, b) in pairs.into_iter().take(MAX_ATTEMPTS) {
-        let Some(n) = attempt(scene, &waiting, (a, b), min_views, limits) else {
-            continue;
-        };
-        if n as f64 >= GOOD_SHARE * waiting.len() as f64 {
-            return Start::Started;
+    let (mut best, mut is_enough) = (None::<(usize, FirstPair)>, false);
+    for pair in pairs.into_iter().take(MAX_ATTEMPTS) {
+        let other = pair.other_motion(scene, limits);
+        for pair in [Some(pair), other].into_iter().flatten() {
+            let Some(made) = attempt(scene, &waiting, &pair, min_views, limits) else {
+                continue;
+            };
+            let is_good = made.n_views as f64 >= GOOD_SHARE * waiting.len() as f64;
+            if is_good && other.is_none() {
+                return Start::Started;
+            }
+            // Another pair may reach more views, and the other motion be the true one.
+            let last = scene.submaps.len() as u32 - 1;
+            scene.dissolve(last);
+            is_enough |= is_good;
+            if best.as_ref().is_none_or(|b| made.n_explained > b.0) {
+                best = Some((made.n_explained, pair));
+            }
         }
-        // Another pair may reach more views.
-        let last = scene.submaps.len() as u32 - 1;
-        scene.dissolve(last);
-        if best.is_none_or(|b| n > b.0) {
-            best = Some((n, (a, b)));
+        if is_enough {
+            break;
         }
     }
-    let again = best.and_then(|(_, pair)| attempt(scene, &waiting, pair, min_views, limits));
+    let again = best.and_then(|(_, pair)| attempt(scene, &waiting, &pair, min_views, limits));
     if again.is_some() {
         Start::Started
     } else {
@@ -82,12 +96,59 @@ pub(crate) fn start(
     }
 }
 
+/// Two views to start from, and the motion between them that is tried.
+#[derive(Debug, Clone, Copy)]
+struct FirstPair {
+    score: f64,
+    ends: (usize, usize),
+    second_from_first: Rigid,
+    plane_share: f64,
+}
+
+impl FirstPair {
+    /// With the other motion that explains matches on a plane as well as this one.
+    fn other_motion(&self, scene: &Reconstruction, limits: &Limits) -> Option<Self> {
+        let (a, b) = self.ends;
+        let views = [&scene.views[a], &scene.views[b]];
+        let matches = &scene.links[&(a, b)].matches;
+        let pixels = pixel_pairs(views[0], views[1], matches);
+        let seed = pair_seed(limits.seed, a, b);
+        if self.plane_share <= HALF_PLANE_SHARE {
+            return None;
+        }
+        let (matrix, _) = homography(&pixels, limits.max_error_px, seed)?;
+        let [first, second] = views.map(|view| rays_from_pixels(&view.lens));
+        let rays: Vec<DVec3> = pixels
+            .iter()
+            .map(|pixel| views[0].lens.ray_in_cam(pixel.0))
+            .collect();
+        let between_rays = second * matrix * first.inverse();
+        let motions = motions_by_plane(&between_rays, &rays);
+        let alike = |m: &Rigid| m.translation.dot(self.second_from_first.translation);
+        let other = motions
+            .into_iter()
+            .min_by(|x, y| alike(x).total_cmp(&alike(y)))?;
+        Some(Self {
+            second_from_first: other,
+            ..*self
+        })
+    }
+}
+
+fn rays_from_pixels(lens: &Intrinsics) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::X / lens.fx,
+        DVec3::Y / lens.fy,
+        DVec3::new(-lens.cx / lens.fx, -lens.cy / lens.fy, 1.0),
+    )
+}
+
 /// Pairs with parallax, best first, and whether any pair had matches enough.
 fn ranked_pairs(
     scene: &mut Reconstruction,
     waiting: &[usize],
     limits: &Limits,
-) -> (Vec<(f64, usize, usize)>, bool) {
+) -> (Vec<FirstPair>, bool) {
     let mut pairs = Vec::new();
     let mut has_matches = false;
     let of_first = |&a: &usize| scene.links.range((a, 0)..(a + 1, 0)).map(|link| *link.0);
@@ -120,29 +181,41 @@ fn ranked_pairs(
             continue;
         }
         let flat = if plane > PLANE_SHARE { 0.1 } else { 1.0 };
-        pairs.push((flat * n as f64 * parallax.min(ENOUGH_PARALLAX_DEG), a, b));
+        pairs.push(FirstPair {
+            score: flat * n as f64 * parallax.min(ENOUGH_PARALLAX_DEG),
+            ends: (a, b),
+            second_from_first: pose,
+            plane_share: plane,
+        });
         if let Some(link) = scene.links.get_mut(&(a, b)) {
             link.motion = Some((pose, parallax));
         }
     }
-    pairs.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+    pairs.sort_by(|x, y| y.score.total_cmp(&x.score).then(x.ends.cmp(&y.ends)));
     (pairs, has_matches)
 }
 
-/// Views of the new submap; `None` and no submap where the scene does not hold.
+/// A submap that was started.
+struct Made {
+    n_views: usize,
+    /// Matches that it explains.
+    n_explained: usize,
+}
+
+/// The new submap, the last one; `None` and no submap where the scene does not hold.
 fn attempt(
     scene: &mut Reconstruction,
     waiting: &[usize],
-    (a, b): (usize, usize),
+    pair: &FirstPair,
     min_views: usize,
     limits: &Limits,
-) -> Option<usize> {
-    let (pose, _) = scene.links[&(a, b)].motion?;
+) -> Option<Made> {
+    let (a, b) = pair.ends;
     let radial = scene.radial;
     let submap = scene.submaps.len() as u32;
     scene.submaps.push(Submap::default());
     scene.place(a, submap, Rigid::IDENTITY);
-    scene.place(b, submap, pose);
+    scene.place(b, submap, pair.second_from_first);
     extend(scene, b, limits.max_error_px);
     adjust_global(scene, submap, limits.max_error_px, 15);
     extend(scene, b, limits.max_error_px);
@@ -155,7 +228,8 @@ fn attempt(
         adjust_global(scene, submap, limits.max_error_px, 15);
         let views = &scene.submaps[submap as usize].views;
         let n = views.len();
-        let explained = explained_share(scene, submap);
+        let (n_explained, n_matches) = explained_matches(scene, submap);
+        let explained = n_explained as f64 / n_matches.max(1) as f64;
         let error_px = median_error_px(scene, views);
         tracing::debug!(a, b, n, explained, error_px, "start of a submap");
         let is_free = submap == 0 && views.iter().any(|&s| !scene.views[s].is_calibrated);
@@ -168,7 +242,10 @@ fn attempt(
         let is_enough = n >= min_views && (!is_free || 2 * n > waiting.len());
         if is_enough && error_px <= 0.75 * limits.max_error_px && explained >= least {
             normalise(scene, submap, a);
-            return Some(n);
+            return Some(Made {
+                n_views: n,
+                n_explained,
+            });
         }
     }
     scene.dissolve(submap);
@@ -195,9 +272,9 @@ pub(crate) fn parallax_deg(scene: &Reconstruction, view_ix: usize) -> f64 {
     median(&mut seen.map(angle).collect::<Vec<f64>>()).unwrap_or(0.0)
 }
 
-/// Of the matches between the views of a submap, the share whose two features see one landmark. A scene turned
-/// inside out (the bas-relief ambiguity) has small errors, too, but leaves many matches out.
-pub(crate) fn explained_share(scene: &Reconstruction, submap: u32) -> f64 {
+/// Of the matches between the views of a submap, those whose two features see one landmark, and all. A scene turned inside
+/// out (the bas-relief ambiguity) has small errors, too, but leaves many matches out.
+fn explained_matches(scene: &Reconstruction, submap: u32) -> (usize, usize) {
     let (mut explained, mut all) = (0, 0);
     for ((a, b), link) in &scene.links {
         if scene.submap_of(*a) != Some(submap) || scene.submap_of(*b) != Some(submap) {
@@ -211,7 +288,7 @@ pub(crate) fn explained_share(scene: &Reconstruction, submap: u32) -> f64 {
         explained += link.matches.iter().filter(agrees).count();
         all += link.matches.len();
     }
-    explained as f64 / f64::from(all.max(1) as u32)
+    (explained, all)
 }
 
 /// Median depth in the first view becomes 1.

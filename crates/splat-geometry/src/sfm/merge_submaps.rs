@@ -116,10 +116,7 @@ fn common_landmarks(scene: &Reconstruction, a: u32, b: u32) -> Vec<(u32, u32)> {
     }
     let mut ranked: Vec<((u32, u32), usize)> = votes.into_iter().collect();
     ranked.sort_by(|x, y| y.1.cmp(&x.1).then(x.0.cmp(&y.0)));
-    let (mut taken_a, mut taken_b) = (
-        BTreeSet::new(),
-        BTreeSet::new(),
-    );
+    let (mut taken_a, mut taken_b) = (BTreeSet::new(), BTreeSet::new());
     ranked.retain(|((l, m), _)| {
         !taken_a.contains(l) && !taken_b.contains(m) && taken_a.insert(*l) && taken_b.insert(*m)
     });

@@ -11,8 +11,10 @@ use crate::sfm::limits::Limits;
 use crate::sfm::pairwise::pair_seed;
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 
-/// Share of the candidate landmarks that must agree with a pose.
+/// Share of the candidate landmarks that must agree with a pose; and where there are fewer than `Limits::min_inliers` of them,
+/// down to half as many: an image of little texture has no more.
 const MIN_SHARE: f64 = 0.25;
+const MIN_SHARE_OF_FEW: f64 = 0.6;
 /// Growth of a submap after which all its views are adjusted together.
 const GLOBAL_GROWTH: f64 = 1.3;
 /// Of fewer views that takes no longer than a few keyframes do, so that it is never left to another thread.
@@ -121,9 +123,7 @@ fn best_waiting(scene: &Reconstruction, pool: &[usize], limits: &Limits) -> Opti
         let Some((submap, n)) = best_submap(scene, view) else {
             continue;
         };
-        let needed = limits
-            .min_inliers
-            .max(scene.views[view].failed_with * 6 / 5 + 1);
+        let needed = (limits.min_inliers / 2).max(scene.views[view].failed_with * 6 / 5 + 1);
         if n >= needed && best.as_ref().is_none_or(|b| n > b.2.len()) {
             best = Some((view, submap, correspondences(scene, view, submap)));
         }
@@ -175,13 +175,18 @@ fn pose(
         &points,
         &pixels,
         &view.lens,
-        (1.5 * limits.max_error_px, limits.min_inliers),
+        (1.5 * limits.max_error_px, limits.min_inliers / 2),
         seed,
     )?;
     let share = found.inliers.len() as f64 / pairs.len() as f64;
+    let min_share = if found.inliers.len() < limits.min_inliers {
+        MIN_SHARE_OF_FEW
+    } else {
+        MIN_SHARE
+    };
     let picked: Vec<DVec2> = found.inliers.iter().map(|&i| pixels[i]).collect();
     let longest = f64::from(view.lens.width_px.max(view.lens.height_px));
-    (share >= MIN_SHARE && spread(&picked) >= MIN_SPREAD * longest).then_some(found.cam_from_world)
+    (share >= min_share && spread(&picked) >= MIN_SPREAD * longest).then_some(found.cam_from_world)
 }
 
 fn spread(pixels: &[DVec2]) -> f64 {

@@ -107,6 +107,16 @@ pub fn homography_share(pairs: &[(DVec2, DVec2)], max_error_px: f64, seed: u64) 
     if n < 8 {
         return 1.0;
     }
+    homography(pairs, max_error_px, seed).map_or(0.0, |found| found.1 as f64 / n as f64)
+}
+
+/// The homography (second ~ H first, in pixels) that most of the matches agree with, and their number.
+pub fn homography(
+    pairs: &[(DVec2, DVec2)],
+    max_error_px: f64,
+    seed: u64,
+) -> Option<(DMat3, usize)> {
+    let n = pairs.len();
     let error = |matrix: &DMat3, (a, b): &(DVec2, DVec2)| {
         let image = *matrix * a.extend(1.0);
         if image.z.abs() < 1e-12 {
@@ -122,7 +132,7 @@ pub fn homography_share(pairs: &[(DVec2, DVec2)], max_error_px: f64, seed: u64) 
     };
     let mut rng = Pcg32::seed_from_u64(seed);
     let best = ransac::search(&mut rng, n, &Tries::fixed(PLANE_TRIES), models, loss);
-    best.map_or(0.0, |(_, n_off)| (n as f64 - n_off) / n as f64)
+    best.map(|(matrix, n_off)| (matrix, n - n_off as usize))
 }
 
 /// RANSAC with truncated costs. Errors are Sampson distances in the unit of `data`.

@@ -7,3 +7,5 @@ pub mod focal;
 pub mod triangulate;
 
 pub mod epipolar;
+
+pub mod plane;

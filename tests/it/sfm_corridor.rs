@@ -1,0 +1,108 @@
+//! Structure from motion in a corridor: most of each image lies on one wall, and has little texture.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use splat_geometry::sfm::estimator::Sfm;
+use splat_geometry::similarity;
+use splat_mapper::node::open_source;
+use splat_mapper::params::settings::Settings;
+use splat_types::frame::{Batch, Keyframe};
+use splat_types::time::Stopwatch;
+use splat_types::transform::{Rigid, extent};
+
+const SCENE: &str = "synthetic:endless?frames=400&rate=30&width=320&height=240";
+/// Frames from one keyframe to the next.
+const EVERY: usize = 4;
+
+fn keyframes() -> Vec<Arc<Keyframe>> {
+    let params = Settings::shipped().params().unwrap();
+    let mut source = open_source::open(SCENE, &params.source, 0).unwrap();
+    let frames = std::iter::from_fn(|| source.next()).step_by(EVERY);
+    let keyframe = |(id, frame)| {
+        Arc::new(Keyframe {
+            id: id as u32,
+            frame,
+            age: Stopwatch::start(),
+        })
+    };
+    frames.enumerate().map(keyframe).collect()
+}
+
+/// Poses of the keyframes of each submap at the end.
+fn submaps(keyframes: &[Arc<Keyframe>]) -> BTreeMap<u32, BTreeMap<u32, Rigid>> {
+    let params = Settings::shipped().params().unwrap();
+    let mut model = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
+    let mut found = BTreeMap::new();
+    let mut reports = Vec::new();
+    for (id, new) in keyframes.chunks(5).enumerate() {
+        reports.push(model.sparse(&Batch {
+            id: id as u32,
+            n_shared: 0,
+            keyframes: new.to_vec(),
+        }));
+    }
+    reports.push(model.finish_sparse());
+    for report in reports {
+        let views = report.views.iter();
+        let views = views.map(|v| (v.keyframe_id, (v.submap, v.submap_from_cam)));
+        let revised = report.revised.iter();
+        let revised = revised.map(|r| (r.keyframe_id, (r.submap, r.submap_from_cam)));
+        found.extend(views.chain(revised));
+    }
+    let mut submaps: BTreeMap<u32, BTreeMap<u32, Rigid>> = BTreeMap::new();
+    for (id, (submap, pose)) in found {
+        submaps.entry(submap).or_default().insert(id, pose);
+    }
+    submaps
+}
+
+/// RMSE after the best similarity, as a share of the way's extent; of (true, found).
+fn position_error(pairs: &[(Rigid, Rigid)]) -> f64 {
+    let places: Vec<_> = pairs
+        .iter()
+        .map(|(t, o)| (t.translation, o.translation))
+        .collect();
+    let fit = similarity::of_points(&places).unwrap();
+    let off = |(t, o): &(_, _)| fit.transform_point(*o).distance_squared(*t);
+    let rmse = (places.iter().map(off).sum::<f64>() / places.len() as f64).sqrt();
+    rmse / extent(&places.iter().map(|p| p.0).collect::<Vec<_>>())
+}
+
+/// By how much a keyframe looks, or lies, in another direction from the first one at most. A straight way fits any other:
+/// this shows the wrong one of a wall's two motions.
+fn turned_deg(pairs: &[(Rigid, Rigid)]) -> f64 {
+    let (truth, found) = pairs[0];
+    let turned = pairs[1..].iter().map(|(t, o)| {
+        let (t, o) = (truth.inverse() * *t, found.inverse() * *o);
+        let looks = t.angle_to(&o);
+        looks.max(t.translation.angle_between(o.translation))
+    });
+    turned.fold(0.0, f64::max).to_degrees()
+}
+
+#[test]
+fn a_wall_is_seen_from_where_the_camera_was_and_few_features_suffice() {
+    let keyframes = keyframes();
+    let submaps = submaps(&keyframes);
+    for (submap, poses) in &submaps {
+        let truth = |id: &u32| keyframes[*id as usize].frame.truth.unwrap();
+        let pairs: Vec<(Rigid, Rigid)> =
+            poses.iter().map(|(id, pose)| (truth(id), *pose)).collect();
+        let (rmse, turned) = (position_error(&pairs), turned_deg(&pairs));
+        let n = poses.len();
+        eprintln!(
+            "submap {submap}: {n} keyframes, ATE {rmse:.4}, directions off by {turned:.2} deg"
+        );
+        assert!(
+            rmse < 0.01 && turned < 2.0,
+            "submap {submap}: {rmse}, {turned} deg"
+        );
+    }
+    let largest = submaps.values().map(BTreeMap::len).max().unwrap();
+    assert!(
+        4 * largest >= 3 * keyframes.len(),
+        "{largest} of {}",
+        keyframes.len()
+    );
+}
