@@ -91,10 +91,12 @@ fn settings_go_over_a_preset_and_a_preset_over_the_defaults() {
 }
 
 /// Keys whose default is another one since version 0.1.0.
-const NEW_DEFAULTS: [&str; 6] = [
+const NEW_DEFAULTS: [&str; 8] = [
     "map.snapshot_secs",
     "mcmc.noise",
     "train.lr_mean",
+    "train.lr_opacity",
+    "train.lr_quat",
     "train.lr_scale",
     "train.lr_sh",
     "train.sh_degree",

@@ -117,6 +117,13 @@ pub struct TrainParams {
     /// Adam rate of the base colour; the bands above take a twentieth.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_sh: f32,
+    /// Steps on a view after which a step on it trains splats at half of these rates; they fall on, to a tenth at least; 0 = they
+    /// do not fall.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub half_rate_steps: u32,
+    /// Rates of scales, quaternions, opacity and colour at the last step, as a share of those at the first.
+    #[schemars(range(min = 0.001, max = 1.0))]
+    pub final_rate: f32,
     /// Updates of a splat before each further band of its colour is trained; 0 = all from the first.
     #[schemars(range(min = 0, max = 1000000))]
     pub sh_interval: u32,
@@ -155,11 +162,13 @@ impl Default for TrainParams {
             depth_mode: DepthLoss::InvDepth,
             epipolar_weight: 0.0,
             robust_inlier_fraction: 1.0,
-            lr_mean: 0.0004,
-            lr_scale: 0.02,
-            lr_quat: 0.001,
-            lr_opacity: 0.05,
-            lr_sh: 0.005,
+            lr_mean: 0.0012,
+            lr_scale: 0.05,
+            lr_quat: 0.006,
+            lr_opacity: 0.1,
+            lr_sh: 0.02,
+            half_rate_steps: 30,
+            final_rate: 0.2,
             sh_interval: 0,
             pose_opt: PoseOptimization::PerView,
             lr_rotation: 0.0005,
@@ -211,7 +220,7 @@ impl Default for McmcParams {
             start: 500,
             growth: 1.05,
             relocation: RelocationRule::Image,
-            noise: 200000.0,
+            noise: 67000.0,
             opacity_reg: 0.01,
             scale_reg: 0.01,
             min_opacity: 0.02,

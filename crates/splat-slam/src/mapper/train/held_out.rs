@@ -45,7 +45,7 @@ pub(crate) fn pose_only(
         weights: LossWeights::default(),
         epipolar_weight: 0.0,
         noise: 0.0,
-        ..schedule::settings(params, scene_depth, pose_error, End::Nears(1.0))
+        ..schedule::settings(params, scene_depth, pose_error, End::Nears(1.0), 0)
     }
 }
 

@@ -119,11 +119,12 @@ impl Trainer {
         map: &mut Parts<'_>,
         end: End,
     ) -> Result<Option<StepSettings>, EngineError> {
-        let Some(view_ix) = self.schedule.next_view(&self.trainable, end) else {
+        let Some(view_ix) = self.schedule.next_view(&self.trainable) else {
             return Ok(None);
         };
         let (scene_depth, pose_error) = (map.keyframes.scene_depth(), map.keyframes.pose_error());
-        let settings = schedule::settings(map.params, scene_depth, pose_error, end);
+        let n_steps = self.schedule.steps_of(view_ix);
+        let settings = schedule::settings(map.params, scene_depth, pose_error, end, n_steps);
         map.engine.step(view_ix, &settings)?;
         self.n_steps += 1;
         Ok(Some(settings))
