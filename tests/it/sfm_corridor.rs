@@ -3,31 +3,16 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::sfm_live::keyframes_of;
 use splat_geometry::sfm::estimator::Sfm;
 use splat_geometry::similarity;
-use splat_mapper::node::open_source;
 use splat_mapper::params::settings::Settings;
 use splat_types::frame::{Batch, Keyframe};
-use splat_types::time::Stopwatch;
 use splat_types::transform::{Rigid, extent};
 
 const SCENE: &str = "synthetic:endless?frames=400&rate=30&width=320&height=240";
 /// Frames from one keyframe to the next.
 const EVERY: usize = 4;
-
-fn keyframes() -> Vec<Arc<Keyframe>> {
-    let params = Settings::shipped().params().unwrap();
-    let mut source = open_source::open(SCENE, &params.source, 0).unwrap();
-    let frames = std::iter::from_fn(|| source.next()).step_by(EVERY);
-    let keyframe = |(id, frame)| {
-        Arc::new(Keyframe {
-            id: id as u32,
-            frame,
-            age: Stopwatch::start(),
-        })
-    };
-    frames.enumerate().map(keyframe).collect()
-}
 
 /// Poses of the keyframes of each submap at the end.
 fn submaps(keyframes: &[Arc<Keyframe>]) -> BTreeMap<u32, BTreeMap<u32, Rigid>> {
@@ -83,7 +68,7 @@ fn turned_deg(pairs: &[(Rigid, Rigid)]) -> f64 {
 
 #[test]
 fn a_wall_is_seen_from_where_the_camera_was_and_few_features_suffice() {
-    let keyframes = keyframes();
+    let keyframes = keyframes_of(SCENE, EVERY);
     let submaps = submaps(&keyframes);
     for (submap, poses) in &submaps {
         let truth = |id: &u32| keyframes[*id as usize].frame.truth.unwrap();

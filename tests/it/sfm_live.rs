@@ -20,9 +20,14 @@ const SCENE: &str = "synthetic:room?frames=48&width=320&height=240";
 const EVERY: usize = 2;
 
 fn keyframes() -> Vec<Arc<Keyframe>> {
+    keyframes_of(SCENE, EVERY)
+}
+
+/// Every `every`-th frame of a scene, numbered from 0.
+pub(crate) fn keyframes_of(scene: &str, every: usize) -> Vec<Arc<Keyframe>> {
     let params = Settings::shipped().params().unwrap();
-    let mut source = open_source::open(SCENE, &params.source, 0).unwrap();
-    let frames = std::iter::from_fn(|| source.next()).step_by(EVERY);
+    let mut source = open_source::open(scene, &params.source, 0).unwrap();
+    let frames = std::iter::from_fn(|| source.next()).step_by(every);
     let keyframe = |(id, frame)| {
         Arc::new(Keyframe {
             id: id as u32,
