@@ -9,7 +9,7 @@ use crate::sfm::pairwise::{pair_seed, pixel_pairs};
 use crate::sfm::reconstruction::{NONE, Reconstruction, Submap};
 use crate::sfm::register::grow;
 use crate::stats::median;
-use crate::two_view::epipolar::{homography, homography_share, motion};
+use crate::two_view::epipolar::{homography, motion};
 use crate::two_view::plane::motions_by_plane;
 use crate::two_view::triangulate::widest_angle;
 use splat_types::camera::Intrinsics;
@@ -67,7 +67,7 @@ pub(crate) fn start(
     }
     let (mut best, mut is_enough) = (None::<(usize, FirstPair)>, false);
     for pair in pairs.into_iter().take(MAX_ATTEMPTS) {
-        let other = pair.other_motion(scene, limits);
+        let other = pair.other_motion(scene);
         for pair in [Some(pair), other].into_iter().flatten() {
             let Some(made) = attempt(scene, &waiting, &pair, min_views, limits) else {
                 continue;
@@ -102,27 +102,24 @@ struct FirstPair {
     score: f64,
     ends: (usize, usize),
     second_from_first: Rigid,
-    plane_share: f64,
+    /// Homography, in pixels, of the plane that shows most of the matches, if it shows half of them.
+    plane: Option<DMat3>,
 }
 
 impl FirstPair {
     /// With the other motion that explains matches on a plane as well as this one.
-    fn other_motion(&self, scene: &Reconstruction, limits: &Limits) -> Option<Self> {
+    fn other_motion(&self, scene: &Reconstruction) -> Option<Self> {
+        let plane = self.plane?;
         let (a, b) = self.ends;
         let views = [&scene.views[a], &scene.views[b]];
         let matches = &scene.links[&(a, b)].matches;
         let pixels = pixel_pairs(views[0], views[1], matches);
-        let seed = pair_seed(limits.seed, a, b);
-        if self.plane_share <= HALF_PLANE_SHARE {
-            return None;
-        }
-        let (matrix, _) = homography(&pixels, limits.max_error_px, seed)?;
         let [first, second] = views.map(|view| rays_from_pixels(&view.lens));
         let rays: Vec<DVec3> = pixels
             .iter()
             .map(|pixel| views[0].lens.ray_in_cam(pixel.0))
             .collect();
-        let between_rays = second * matrix * first.inverse();
+        let between_rays = second * plane * first.inverse();
         let motions = motions_by_plane(&between_rays, &rays);
         let alike = |m: &Rigid| m.translation.dot(self.second_from_first.translation);
         let other = motions
@@ -174,18 +171,21 @@ fn ranked_pairs(
         if parallax < limits.min_parallax_deg {
             continue;
         }
-        let plane = homography_share(&pixels, limits.max_error_px, seed);
+        let on_plane = homography(&pixels, limits.max_error_px, seed);
+        let share = on_plane.map_or(0.0, |found| found.1 as f64 / n as f64);
         let is_calibrated = scene.views[a].is_calibrated && scene.views[b].is_calibrated;
         // With a wrong focal length a mere turn looks like parallax.
-        if plane > PLANE_SHARE && !is_calibrated && scene.submaps.is_empty() {
+        if share > PLANE_SHARE && !is_calibrated && scene.submaps.is_empty() {
             continue;
         }
-        let flat = if plane > PLANE_SHARE { 0.1 } else { 1.0 };
+        let flat = if share > PLANE_SHARE { 0.1 } else { 1.0 };
         pairs.push(FirstPair {
             score: flat * n as f64 * parallax.min(ENOUGH_PARALLAX_DEG),
             ends: (a, b),
             second_from_first: pose,
-            plane_share: plane,
+            plane: on_plane
+                .filter(|_| share > HALF_PLANE_SHARE)
+                .map(|found| found.0),
         });
         if let Some(link) = scene.links.get_mut(&(a, b)) {
             link.motion = Some((pose, parallax));
