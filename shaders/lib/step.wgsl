@@ -21,6 +21,7 @@ struct Step {
     depth_width: u32,
     depth_height: u32,
     lr_mean: f32,
+    lr_mean_decay: f32,
     lr_scale: f32,
     lr_quat: f32,
     lr_opacity: f32,

@@ -410,7 +410,8 @@ impl MapStage {
 
     fn step_until(&mut self, target: u64, publish: &mut Publish<'_>) {
         let watch = Stopwatch::start();
-        self.make_steps(target, &|_| End::Unknown, publish);
+        let end = schedule::end_of_run(&self.params, self.live.is_none());
+        self.make_steps(target, &|_| end, publish);
         self.figures.optimise_secs += watch.secs();
         self.snapshot_if_due(publish);
     }

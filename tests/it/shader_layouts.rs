@@ -93,6 +93,7 @@ fn the_step_has_the_layout_of_the_host() {
         depth_width,
         depth_height,
         lr_mean,
+        lr_mean_decay,
         lr_scale,
         lr_quat,
         lr_opacity,

@@ -59,6 +59,9 @@ pub struct McmcSettings {
 pub struct StepSettings {
     /// Of the means, world units; 1.6e-4 times the scene's extent in 3DGS, decaying to a hundredth.
     pub lr_mean: f32,
+    /// Fall of `lr_mean` with the updates n that a splat has had, this one included: `lr_mean / (1 + lr_mean_decay n)`, a hundredth
+    /// at least; 0: none.
+    pub lr_mean_decay: f32,
     /// Of the log-scales; 5e-3 in 3DGS.
     pub lr_scale: f32,
     /// Of the quaternions as stored; 1e-3 in 3DGS.

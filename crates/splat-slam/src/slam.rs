@@ -139,7 +139,8 @@ impl Slam {
     /// Makes up to `n` optimiser steps between frames. Returns how many were made: fewer only while there is nothing to
     /// train on.
     pub fn step(&mut self, n: u64) -> Result<u64, SlamError> {
-        Ok(self.mapper.step(n, End::Unknown)?)
+        let end = self.end();
+        Ok(self.mapper.step(n, end)?)
     }
 
     /// Maps what is left, makes the steps that are left, and lets the map go.
@@ -198,8 +199,14 @@ impl Slam {
         self.take_correction(events);
         let due = schedule::due(&self.params.mapper, progress.unwrap_or(0.0));
         let n = due.saturating_sub(self.mapper.n_steps());
-        self.mapper.step(n, End::Unknown)?;
+        let end = self.end();
+        self.mapper.step(n, end)?;
         Ok(())
+    }
+
+    /// What is known of it while keyframes come.
+    fn end(&self) -> End {
+        schedule::end_of_run(&self.params.mapper, self.params.n_frames.is_some())
     }
 
     fn take_correction(&mut self, events: &mut Vec<SlamEvent>) {

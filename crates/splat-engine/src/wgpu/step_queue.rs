@@ -164,6 +164,7 @@ impl WgpuEngine {
             depth_width,
             depth_height,
             lr_mean: s.lr_mean,
+            lr_mean_decay: s.lr_mean_decay,
             lr_scale: s.lr_scale,
             lr_quat: s.lr_quat,
             lr_opacity: s.lr_opacity,

@@ -25,6 +25,7 @@ pub struct Step {
     pub depth_width: u32,
     pub depth_height: u32,
     pub lr_mean: f32,
+    pub lr_mean_decay: f32,
     pub lr_scale: f32,
     pub lr_quat: f32,
     pub lr_opacity: f32,

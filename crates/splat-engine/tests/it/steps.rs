@@ -142,6 +142,8 @@ fn every_backend_takes_the_references_steps() {
                 PoseMode::Direct
             },
             lr_mean: steady.lr_mean / (n + 1) as f32,
+            // None, half after three updates, and the least there is.
+            lr_mean_decay: [0.0, 1.0 / 3.0, 1e3][n % 3],
             ..steady.clone()
         })
         .collect();

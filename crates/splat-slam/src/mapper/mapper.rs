@@ -161,7 +161,7 @@ impl Mapper {
     /// One optimiser update per step, with seeding and removal at their intervals. Returns the steps made, which
     /// are fewer only when there is nothing to train on.
     pub fn step(&mut self, n: u64, end: End) -> Result<u64, EngineError> {
-        if end != End::Unknown {
+        if end.is_near() {
             self.splats.set_progress(None);
         }
         if self.submaps.waits_for_registration() {
@@ -195,10 +195,10 @@ impl Mapper {
             if n_steps.is_multiple_of(ANCHOR_EVERY) && settings.pose != PoseMode::Held {
                 self.hold_anchor()?;
             }
-            let looks = if end == End::Unknown {
-                (SCALE_ONE_EVERY, 1)
-            } else {
+            let looks = if end.is_near() {
                 (ANCHOR_EVERY, usize::MAX)
+            } else {
+                (SCALE_ONE_EVERY, 1)
             };
             if n_steps.is_multiple_of(looks.0) {
                 let source = self.scale.scale().source;

@@ -105,6 +105,10 @@ pub struct TrainParams {
     /// Adam rate, share of the scene scale; decays to a hundredth over the run.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_mean: f32,
+    /// Updates of a splat after which lr_mean is half for it while keyframes may still come; it falls on, to a hundredth at least;
+    /// 0 = it does not fall.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub half_mean_updates: u32,
     /// Adam rate of log-scales.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_scale: f32,
@@ -163,6 +167,7 @@ impl Default for TrainParams {
             epipolar_weight: 0.0,
             robust_inlier_fraction: 1.0,
             lr_mean: 0.0012,
+            half_mean_updates: 30,
             lr_scale: 0.05,
             lr_quat: 0.006,
             lr_opacity: 0.1,

@@ -51,10 +51,13 @@ impl SplatAdam {
         for &ix in visible {
             self.n_updates[ix] += 1;
             let t = self.n_updates[ix];
+            let settled =
+                (1.0 / (1.0 + f64::from(settings.lr_mean_decay) * f64::from(t))).max(0.01);
             for k in 0..3 {
                 let (m, v) = (&mut self.m.means[ix][k], &mut self.v.means[ix][k]);
-                params.means[ix][k] -=
-                    step(m, v, gradient.means[ix][k], t, SPLAT_EPS) * f64::from(settings.lr_mean);
+                params.means[ix][k] -= step(m, v, gradient.means[ix][k], t, SPLAT_EPS)
+                    * f64::from(settings.lr_mean)
+                    * settled;
                 let (m, v) = (&mut self.m.log_scales[ix][k], &mut self.v.log_scales[ix][k]);
                 let g = gradient.log_scales[ix][k];
                 params.log_scales[ix][k] -=

@@ -40,8 +40,16 @@ pub struct Schedule {
 pub enum End {
     /// Nothing: keyframes may still come, and the map may be wanted at any moment.
     Unknown,
+    /// It comes after the last keyframe, with steps in which rates can fall.
+    Ahead,
     /// It comes; the share of the way to it that is done, 0 to 1.
     Nears(f32),
+}
+
+impl End {
+    pub fn is_near(self) -> bool {
+        matches!(self, Self::Nears(_))
+    }
 }
 
 impl Schedule {
@@ -70,7 +78,7 @@ impl Schedule {
 
     /// Whether depth that nobody verified may be guessed where a view has a hole.
     pub fn may_fill(&self, view_ix: usize, end: End) -> bool {
-        end != End::Unknown || self.steps_of(view_ix) >= STEPS_BEFORE_FILLING
+        end.is_near() || self.steps_of(view_ix) >= STEPS_BEFORE_FILLING
     }
 
     /// A view is as good as new: it has depth that it had not.
@@ -104,6 +112,15 @@ impl Schedule {
     }
 }
 
+/// What is known of the end while keyframes come, `has_end`: of a run of `train.steps`.
+pub fn end_of_run(params: &MapperParams, has_end: bool) -> End {
+    if has_end && params.train.final_share > 0.0 {
+        End::Ahead
+    } else {
+        End::Unknown
+    }
+}
+
 /// Steps of the whole run that should be done when this share of the input has come.
 pub fn due(params: &MapperParams, progress: f64) -> u64 {
     (params.train.steps as f64 * (1.0 - params.train.final_share) * progress.clamp(0.0, 1.0)) as u64
@@ -127,7 +144,7 @@ pub fn settings(
         }
     };
     let done = match end {
-        End::Unknown => 0.0,
+        End::Unknown | End::Ahead => 0.0,
         End::Nears(share) => share.clamp(0.0, 1.0),
     };
     let decayed = |rate: f32, last: f32| rate * last.powf(done);
@@ -147,6 +164,7 @@ pub fn settings(
     weights.scale_reg = if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE));
     StepSettings {
         lr_mean,
+        lr_mean_decay: settling(params, end),
         lr_scale: of_splats(params.train.lr_scale),
         lr_quat: of_splats(params.train.lr_quat),
         lr_opacity: of_splats(params.train.lr_opacity),
@@ -177,6 +195,15 @@ pub fn settings(
         train_splats: true,
         pose: pose_step(params),
         ..StepSettings::default()
+    }
+}
+
+/// Where more keyframes may come, each splat's own updates stand in for an end: a mean that follows every view at the full rate, half
+/// a pixel a step, never comes to rest.
+fn settling(params: &MapperParams, end: End) -> f32 {
+    match (end, params.train.half_mean_updates) {
+        (End::Unknown, half @ 1..) => 1.0 / half as f32,
+        _ => 0.0,
     }
 }
 
@@ -242,7 +269,15 @@ mod tests {
         let params = MapperParams::default();
         let at = |end| settings(&params, 2.0, [0.0; 2], end, 0);
         let (open, last) = (at(End::Unknown), at(End::Nears(1.0)));
-        assert_eq!(open, at(End::Nears(0.0)), "one schedule");
+        assert_eq!(at(End::Ahead), at(End::Nears(0.0)), "one schedule");
+        let all_but_means = StepSettings {
+            lr_mean_decay: 0.0,
+            ..open.clone()
+        };
+        assert_eq!(all_but_means, at(End::Ahead));
+        assert!((open.lr_mean_decay - 1.0 / 30.0).abs() < 1e-6);
+        assert_eq!(end_of_run(&params, true), End::Ahead);
+        assert_eq!(end_of_run(&params, false), End::Unknown);
         assert!((last.lr_mean / open.lr_mean - 0.01).abs() < 1e-6);
         assert!(last.weights.depth_weight < open.weights.depth_weight);
         assert!((last.lr_scale / open.lr_scale - 0.2).abs() < 1e-6);
