@@ -22,6 +22,8 @@ struct State {
     has_registered: bool,
     /// A batch is on its way or at work.
     is_sent: bool,
+    /// Answers of geometry that the map has not taken in yet.
+    n_answers: usize,
     has_ended: bool,
     n_dropped_batches: u64,
 }
@@ -47,9 +49,10 @@ impl Backpressure {
         !state.is_sent || state.has_ended
     }
 
-    /// Poses of keyframes are on their way: steps of splats wait for them.
+    /// Poses of keyframes are on their way, to geometry or from there to the map: splats and depth wait for them.
     pub(crate) fn is_at_work(&self) -> bool {
-        !self.is_open()
+        let state = self.lock();
+        (state.is_sent || state.n_answers > 0) && !state.has_ended
     }
 
     /// Selection is about to send a batch. `false`: geometry takes none any more.
@@ -79,6 +82,17 @@ impl Backpressure {
     /// Geometry: the batch that it took is done.
     pub(crate) fn done(&self) {
         self.lock().is_sent = false;
+    }
+
+    /// Geometry: an answer goes to the map.
+    pub(crate) fn answer(&self) {
+        self.lock().n_answers += 1;
+    }
+
+    /// The map has taken in an answer.
+    pub(crate) fn answer_taken(&self) {
+        let mut state = self.lock();
+        state.n_answers = state.n_answers.saturating_sub(1);
     }
 
     /// Geometry takes no more.
@@ -111,7 +125,10 @@ mod tests {
         assert!(backpressure.is_open() && backpressure.send());
         assert!(!backpressure.is_open(), "the first is at work");
         backpressure.done();
-        assert!(backpressure.is_open());
+        backpressure.answer();
+        assert!(backpressure.is_open() && backpressure.is_at_work());
+        backpressure.answer_taken();
+        assert!(!backpressure.is_at_work());
         backpressure.end();
         assert!(backpressure.is_open() && !backpressure.send());
     }

@@ -337,6 +337,7 @@ fn give_poses(
             Next::Ended => return last_answer(stage, answers),
         };
         geometry.load_shed.depth_secs = stage.waited_secs;
+        backpressure.answer();
         if answers.send((newest.clone(), geometry)).is_err() {
             return None;
         }

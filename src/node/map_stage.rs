@@ -11,9 +11,11 @@ use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
 use crate::node::requests::RequestHandler;
 use crate::node::stop::ShutdownTimeout;
+use crate::node::track_thread::KeyframeUpdate;
 use crate::params::params::Params;
 use splat_engine::error::EngineError;
 use splat_geometry::answer::GeometryBatch;
+use splat_io::queue::Sender;
 use splat_ros::output::{Output, OutputHandles};
 use splat_ros::reports::Reports;
 use splat_ros::status::{MapStatus, SelectStatus};
@@ -191,11 +193,13 @@ impl MapStage {
         }
     }
 
-    /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end.
+    /// Adds a batch; in a replay makes the steps that are due by then. `None`: what the model said at its end. `updates` get all
+    /// keyframes as soon as poses are in the map: splats take longer.
     pub(crate) fn add(
         &mut self,
         batch: Option<&Batch>,
         geometry: &GeometryBatch,
+        updates: Option<&Sender<KeyframeUpdate>>,
         publish: &mut Publish<'_>,
     ) {
         let newest = batch
@@ -214,15 +218,27 @@ impl MapStage {
             }
         }
         let watch = Stopwatch::start();
-        let fresh = self.on_map(|map| map.add(batch, geometry, progress));
-        for id in fresh.unwrap_or_default() {
-            if let Some(age) = self.figures.unpublished.get(&id) {
-                let secs = age.secs();
-                tracing::debug!("keyframe {id} has its pose after {secs:.2} s");
-                self.figures.latency.to_pose_secs.push(secs);
-                self.report(|status| status.keyframe_to_pose.note(secs));
+        let ages = self.figures.unpublished.clone();
+        // Of the last attempt, where a device is lost.
+        let mut to_pose_secs = Vec::new();
+        let mut on_poses = |map: &mut Mapper, fresh: &[u32]| {
+            let ages = fresh
+                .iter()
+                .filter_map(|id| Some((*id, ages.get(id)?.secs())));
+            to_pose_secs = ages.collect();
+            if let Some(updates) = updates {
+                // A tracker that is gone is no reason to stop mapping.
+                drop(updates.send(map.keyframe_views()?));
             }
+            Ok(())
+        };
+        self.on_map(|map| map.add_with(batch, geometry, progress, &mut on_poses));
+        for (id, secs) in &to_pose_secs {
+            tracing::debug!("keyframe {id} has its pose after {secs:.2} s");
+            self.report(|status| status.keyframe_to_pose.note(*secs));
         }
+        let to_pose_secs = to_pose_secs.into_iter().map(|(_, secs)| secs);
+        self.figures.latency.to_pose_secs.extend(to_pose_secs);
         self.figures.optimise_secs += watch.secs();
         self.report_counts();
         publish(None, self.progress());

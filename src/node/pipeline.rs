@@ -164,7 +164,7 @@ impl Stages {
         let track = &mut self.track;
         let mut map_batch = |batch: Batch, track: &mut TrackStage| -> Result<(), GeometryError> {
             let answer = geometry.infer(&batch)?;
-            map.add(Some(&batch), &answer, &mut publish);
+            map.add(Some(&batch), &answer, None, &mut publish);
             if track.is_on() {
                 track.update(&map.keyframe_views());
             }
@@ -188,7 +188,7 @@ impl Stages {
         }
         let result = result.and_then(|()| {
             let rest = geometry.finish()?;
-            map.add(None, &rest, &mut publish);
+            map.add(None, &rest, None, &mut publish);
             Ok(())
         });
         let snapshot = map.finish(&mut publish);
@@ -405,8 +405,14 @@ fn run_map(
             Ok(answer) => answer,
             Err(ending) => break ending,
         };
-        stage.add(batch.as_deref(), &geometry, publish);
-        send_updates(&mut stage, updates);
+        let at_once = updates.filter(|_| poses.is_some());
+        stage.add(batch.as_deref(), &geometry, at_once, publish);
+        if let Some(poses) = poses {
+            poses.answer_taken();
+        }
+        if at_once.is_none() {
+            send_updates(&mut stage, updates);
+        }
     };
     let snapshot = stage.finish(publish);
     send_updates(&mut stage, updates);

@@ -11,6 +11,8 @@ mod parking;
 
 mod recovery;
 
+mod registration;
+
 pub mod reports;
 
 mod resumption;
@@ -19,11 +21,8 @@ use std::sync::Arc;
 
 use crate::mapper::cameras::Cameras;
 use crate::mapper::depth_scale::scale_depths;
-use crate::mapper::keyframes::registered::{DepthFit, RegisteredKeyframe};
-use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::keyframes::store::{KeyframeStore, ROTATE_EVERY};
 use crate::mapper::keyframes::tracker_views::views_of;
-use crate::mapper::keyframes::training_image::{rescaled, training_image};
 use crate::mapper::last_good::LastGood;
 use crate::mapper::metric_scale::MetricScale;
 use crate::mapper::metric_scale_params::ScaleParams;
@@ -33,15 +32,13 @@ use crate::mapper::parts::Parts;
 use crate::mapper::splats::store::SplatSet;
 use crate::mapper::submaps::pose_anchor::ANCHOR_EVERY;
 use crate::mapper::submaps::registry::Submaps;
-use crate::mapper::train::landmark_depth::landmark_depth;
 use crate::mapper::train::schedule::End;
 use crate::mapper::train::trainer::Trainer;
-use crate::track::landmarks::{KeyframeView, TriangulatedLandmarks};
+use crate::track::landmarks::KeyframeView;
 use splat_engine::error::EngineError;
 use splat_engine::settings::PoseMode;
 use splat_engine::traits::Engine;
-use splat_engine::view::TrainingView;
-use splat_geometry::answer::{GeometryBatch, Observations, PoseStd, View};
+use splat_geometry::answer::{GeometryBatch, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::frame::Batch;
 use splat_types::snapshot::Scale;
@@ -55,6 +52,9 @@ const PRUNE_EVERY: u64 = 400;
 const SCALE_ONE_EVERY: u64 = 3;
 /// Seeding and removal end here, as a share of the final steps: what comes later has no time to converge.
 const LAST_RESEED: f32 = 0.6;
+
+/// Is given the map and the ids of keyframes that are new in it.
+pub type OnPoses<'a> = dyn FnMut(&mut Mapper, &[u32]) -> Result<(), EngineError> + 'a;
 
 /// All splats and poses, and the engine that improves them. Many methods: it is the one face of the map, and each
 /// of its users needs a few.
@@ -117,6 +117,17 @@ impl Mapper {
         geometry: &GeometryBatch,
         progress: Option<f64>,
     ) -> Result<Vec<u32>, EngineError> {
+        self.add_with(batch, geometry, progress, &mut |_, _| Ok(()))
+    }
+
+    /// [`add`](Self::add), which hands out the same ids, and the map, as soon as all poses are in it: splats take longer.
+    pub fn add_with(
+        &mut self,
+        batch: Option<&Batch>,
+        geometry: &GeometryBatch,
+        progress: Option<f64>,
+        on_poses: &mut OnPoses<'_>,
+    ) -> Result<Vec<u32>, EngineError> {
         if let Some(batch) = batch {
             let given_up = self.keyframes.remember(&batch.keyframes, MAX_WAITING);
             self.submaps.forget(&given_up);
@@ -132,7 +143,8 @@ impl Mapper {
         if let Some(parked) = update.unparked {
             self.unpark(parked)?;
         }
-        self.place(update.joined, PoseStd::default(), &geometry.observations)?;
+        let joined = self.register(update.joined, PoseStd::default(), &geometry.observations)?;
+        self.seed(&joined, &geometry.observations)?;
         let (parts, trainer) = self.split();
         trainer.record_observations(&parts, &geometry.observations);
         let mut own = self.submaps.sort(&geometry.views, &self.keyframes);
@@ -141,9 +153,11 @@ impl Mapper {
         } else {
             self.follow_newest()?
         });
-        let fresh = self.place(own, geometry.pose_error, &geometry.observations)?;
+        let own = self.register(own, geometry.pose_error, &geometry.observations)?;
+        on_poses(self, &own.fresh)?;
+        self.seed(&own, &geometry.observations)?;
         self.settle_in()?;
-        Ok(fresh)
+        Ok(own.fresh)
     }
 
     /// After keyframes came or moved.
@@ -403,139 +417,10 @@ impl Mapper {
         Ok(())
     }
 
-    fn seed_all(&mut self, fresh: &[u32], deepened: &[u32]) -> Result<(), EngineError> {
-        if !fresh.is_empty() || !deepened.is_empty() {
-            self.trainer.reset_convergence();
-        }
-        let has_depth = |id: &&u32| self.keyframes.registered()[*id].depth.width_px > 0;
-        let fresh: Vec<u32> = fresh.iter().filter(has_depth).copied().collect();
-        let n = fresh.len() + deepened.len();
-        self.balance(n * self.params.train.seeds_per_keyframe)?;
-        let (mut parts, trainer) = self.split();
-        trainer.seed_each(&mut parts, &fresh, false)?;
-        trainer.seed_each(&mut parts, deepened, true)?;
-        self.report_renumbered();
-        Ok(())
-    }
-
-    /// What keyframes without depth show is in the map at once, coarsely, from where their landmarks are.
-    fn seed_provisional(
-        &mut self,
-        fresh: &[u32],
-        world_per_unit: f64,
-        observations: &[Observations],
-    ) -> Result<(), EngineError> {
-        for seen in observations
-            .iter()
-            .filter(|seen| fresh.contains(&seen.keyframe_id))
-        {
-            let (mut parts, trainer) = self.split();
-            let registered = parts.keyframes.registered().get(&seen.keyframe_id);
-            let Some(registered) = registered.filter(|registered| registered.depth.width_px == 0)
-            else {
-                continue;
-            };
-            let image = &registered.keyframe.frame.image;
-            let size_px = [image.width_px, image.height_px];
-            if let Some(depth) = landmark_depth(&seen.landmarks, size_px, world_per_unit) {
-                trainer.seed_provisional(&mut parts, seen.keyframe_id, &depth)?;
-            }
-        }
-        self.report_renumbered();
-        Ok(())
-    }
-
     fn report_renumbered(&mut self) {
         if self.splats.take_renumbered() {
             let correction = MapCorrection::identity(Reason::Renumbered);
             self.submaps.start_epoch(correction);
         }
-    }
-
-    /// Gives views of the map's own submap their place, and seeds splats from them.
-    fn place(
-        &mut self,
-        views: Vec<View>,
-        pose_error: PoseStd,
-        observations: &[Observations],
-    ) -> Result<Vec<u32>, EngineError> {
-        if views.is_empty() {
-            return Ok(Vec::new());
-        }
-        let map_poses = self.engine.poses()?;
-        let world_from_submap = self.keyframes.world_from_submap(&map_poses);
-        self.keyframes.note_pose_error(
-            pose_error.rotation_rad as f32,
-            (pose_error.translation * world_from_submap.scale) as f32,
-        );
-        let is_new = |view: &&View| !self.has_keyframe(view.keyframe_id);
-        self.enforce_budget(views.iter().filter(is_new).count())?;
-        let max_side = self.params.train.max_side;
-        let (mut fresh, mut deepened) = (Vec::new(), Vec::new());
-        for view in views {
-            let given = self.keyframes.registered().get(&view.keyframe_id);
-            let factor = world_from_submap.scale
-                * given.map_or(1.0, |registered| registered.depth_fit.factor);
-            let depth = Arc::new(rescaled(&view.depth, factor));
-            let median_depth = depth.median();
-            if self.has_keyframe(view.keyframe_id) {
-                if self
-                    .keyframes
-                    .update_depth(&view, depth, max_side, &mut *self.engine)?
-                {
-                    deepened.push(view.keyframe_id);
-                    let view_ix = self.keyframes.registered()[&view.keyframe_id].view_ix;
-                    self.trainer.renew(view_ix);
-                }
-            } else if let Some(keyframe) = self.keyframes.take_waiting(view.keyframe_id) {
-                let (image, intrinsics) = training_image(&keyframe, &view, max_side);
-                let cam_from_world = world_from_submap
-                    .transform_pose(&view.submap_from_cam)
-                    .inverse();
-                let view_ix = self.engine.add_view(TrainingView {
-                    image: Arc::clone(&image),
-                    intrinsics,
-                    cam_from_world,
-                    depth: Some(Arc::clone(&depth)),
-                    mask: None,
-                })?;
-                let every = self.params.map.holdout;
-                let is_held_out = keyframe.frame.is_held_out
-                    || (every > 0 && view.keyframe_id % every == every / 2);
-                let id = view.keyframe_id;
-                self.keyframes.insert(
-                    id,
-                    RegisteredKeyframe {
-                        keyframe,
-                        view_ix,
-                        submap_from_cam: view.submap_from_cam,
-                        image,
-                        intrinsics,
-                        lens: view.lens,
-                        depth,
-                        landmarks: TriangulatedLandmarks::none(),
-                        depth_fit: DepthFit {
-                            median: median_depth,
-                            ..DepthFit::default()
-                        },
-                        health: view.health,
-                        is_held_out,
-                        home: Residency::here(),
-                    },
-                );
-                if !is_held_out {
-                    self.trainer.add_trainable(view_ix);
-                }
-                fresh.push(id);
-            }
-        }
-        self.keyframes
-            .keep_landmarks(observations, world_from_submap.scale);
-        self.keyframes.measure_scene();
-        self.share_budget();
-        self.splats.prune(&self.params, &mut *self.engine)?;
-        self.seed_all(&fresh, &deepened)?;
-        self.seed_provisional(&fresh, world_from_submap.scale, observations)?;
-        Ok(fresh)
     }
 }

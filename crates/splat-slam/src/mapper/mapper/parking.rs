@@ -15,7 +15,8 @@ impl Mapper {
     pub fn settle_on_largest(&mut self) -> Result<(), EngineError> {
         if let Some(submap) = self.submaps.parked().larger_than(self.n_keyframes()) {
             let views = self.activate(submap)?;
-            self.place(views, PoseStd::default(), &[])?;
+            let new = self.register(views, PoseStd::default(), &[])?;
+            self.seed(&new, &[])?;
             self.settle_in()?;
         }
         Ok(())
