@@ -224,7 +224,7 @@ fn update_splat(splat_ix: u32, direction: vec3<f32>, g: Gradient) {
     let correction = corrections(age);
     let m = 8u * splat_ix;
     let in_all = moments[m + 4u].w + 1.0;
-    let lr_mean = step.lr_mean * max(1.0 / (1.0 + step.lr_mean_decay * in_all), MIN_MEAN_DECAY);
+    let lr_mean = step.lr_mean * max(1.0 / (1.0 + step.lr_mean_decay * in_all), MIN_RATE_SHARE);
     let position_rates = vec4<f32>(vec3<f32>(lr_mean), step.lr_opacity);
     var mean = updated(geometry[at], vec4<f32>(g.mean, g.opacity_logit), m, position_rates, correction);
     let quat = updated(geometry[at + 1u], g.quat, m + 2u, vec4<f32>(step.lr_quat), correction);

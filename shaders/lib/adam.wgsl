@@ -5,8 +5,8 @@ const BETA_2: f32 = 0.999;
 const SPLAT_EPS: f32 = 1e-15;
 // Larger than for splats: a view that sees next to nothing shall not run away on noise.
 const VIEW_EPS: f32 = 1e-8;
-// What lr_mean_decay leaves of a rate at least.
-const MIN_MEAN_DECAY: f32 = 0.01;
+// What a decay leaves of a rate at least.
+const MIN_RATE_SHARE: f32 = 0.01;
 const LN_BETA_1: f32 = -0.105360515;
 const LN_BETA_2: f32 = -0.0010005003;
 

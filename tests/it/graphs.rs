@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::scenes::ignored;
+
 /// ONNX: numbers of the types of tensors and of attributes.
 const FLOAT: u64 = 1;
 const INT64: u64 = 7;
@@ -115,9 +117,7 @@ pub(crate) fn library() -> Option<PathBuf> {
         .or(installed)
         .and_then(|path| path.canonicalize().ok());
     if found.is_none() {
-        let reason = "no ONNX Runtime in target/onnxruntime; run scripts/setup test";
-        assert!(std::env::var("CI").as_deref() != Ok("true"), "{reason}");
-        eprintln!("ignored: {reason}");
+        ignored("no ONNX Runtime in target/onnxruntime; run scripts/setup test");
     }
     found
 }

@@ -6,7 +6,7 @@ use glam::DVec2;
 
 use crate::graphs::library;
 use crate::lpips::{network, saved};
-use crate::scenes::scene;
+use crate::scenes::{ignored, scene};
 use crate::sfm::{run, shown};
 use splat_geometry::features::descriptor::{Descriptors, Features, working_image};
 use splat_geometry::features::extractor::FeatureExtractor;
@@ -29,7 +29,7 @@ fn model() -> Option<(PathBuf, PathBuf)> {
     let library = library()?;
     let model = scene("fox")?.join("../../models/xfeat_480x640.onnx");
     if !model.is_file() {
-        eprintln!("ignored: no network: {}", model.display());
+        ignored(&format!("no network: {}", model.display()));
         return None;
     }
     Some((library, model))

@@ -40,7 +40,7 @@ struct Attribute<'a> {
     grads: &'a [f32],
     grad_stride: usize,
     rate: f32,
-    /// Of the rate with the updates of a splat.
+    /// Fall of the rate with the updates of a splat; 0: none.
     decay: f32,
 }
 
@@ -143,11 +143,7 @@ impl Optimiser {
     ) -> usize {
         let n_skipped = self.grow_older(projected, &gradients.is_finite, now);
         let (g, updated, sh_stride) = (gradients, &self.updated, splats.sh_stride());
-        let run = |params,
-                   moments,
-                   grads,
-                   [stride, n, grad_stride]: [usize; 3],
-                   [rate, decay]: [f32; 2]| {
+        let run = |params, moments, grads, [stride, n, grad_stride]: [usize; 3], rate| {
             let attribute = Attribute {
                 params,
                 stride,
@@ -156,13 +152,21 @@ impl Optimiser {
                 grads,
                 grad_stride,
                 rate,
-                decay,
+                decay: 0.0,
             };
             adam(attribute, projected, updated);
         };
-        let (params, grads) = (splats.means.as_flattened_mut(), g.means.as_flattened());
-        let rates = [settings.lr_mean, settings.lr_mean_decay];
-        run(params, &mut self.means, grads, [3; 3], rates);
+        let means = Attribute {
+            params: splats.means.as_flattened_mut(),
+            stride: 3,
+            n: 3,
+            moments: &mut self.means,
+            grads: g.means.as_flattened(),
+            grad_stride: 3,
+            rate: settings.lr_mean,
+            decay: settings.lr_mean_decay,
+        };
+        adam(means, projected, updated);
         let params = splats.log_scales.as_flattened_mut();
         let grads = g.log_scales.as_flattened();
         run(
@@ -170,28 +174,16 @@ impl Optimiser {
             &mut self.log_scales,
             grads,
             [3; 3],
-            [settings.lr_scale, 0.0],
+            settings.lr_scale,
         );
         let (params, grads) = (splats.quats.as_flattened_mut(), g.quats.as_flattened());
-        run(
-            params,
-            &mut self.quats,
-            grads,
-            [4; 3],
-            [settings.lr_quat, 0.0],
-        );
+        run(params, &mut self.quats, grads, [4; 3], settings.lr_quat);
         let (params, grads) = (&mut splats.opacity_logits, &g.opacity_logits);
         let moments = &mut self.opacity_logits;
-        run(params, moments, grads, [1; 3], [settings.lr_opacity, 0.0]);
+        run(params, moments, grads, [1; 3], settings.lr_opacity);
         let strides = [sh_stride, BAND_0, g.sh_stride];
         let moments = &mut self.sh_band_0;
-        run(
-            &mut splats.sh,
-            moments,
-            &g.sh,
-            strides,
-            [settings.lr_sh0, 0.0],
-        );
+        run(&mut splats.sh, moments, &g.sh, strides, settings.lr_sh0);
         self.sh_above
             .update(splats, projected, g, updated, settings);
         n_skipped
@@ -259,7 +251,7 @@ fn adam(attribute: Attribute<'_>, projected: &Projected, updated: &[Option<Updat
                 (&mut first[row.clone()], &mut second[row]),
                 &grads[v * grad_stride..v * grad_stride + n],
                 correction(update_counts.since_cleared),
-                rate * update_counts.share_of_mean_rate(decay),
+                rate * update_counts.share_of_rate(decay),
             );
         }
     });

@@ -5,8 +5,8 @@ use std::sync::LazyLock;
 pub(crate) const BETA_1: f32 = 0.9;
 pub(crate) const BETA_2: f32 = 0.999;
 pub(crate) const EPS: f32 = 1e-15;
-/// What `lr_mean_decay` leaves of a rate at least.
-const MIN_MEAN_DECAY: f32 = 0.01;
+/// What a decay leaves of a rate at least.
+const MIN_RATE_SHARE: f32 = 0.01;
 /// From this age on both corrections are 1 in f32.
 const MAX_CORRECTED_AGE: u16 = 16_640;
 
@@ -37,9 +37,9 @@ pub(crate) struct UpdateCounts {
 }
 
 impl UpdateCounts {
-    /// Share of its rate at which a splat's mean is moved by this update: settled ones shall not follow each view.
-    pub(crate) fn share_of_mean_rate(self, decay: f32) -> f32 {
-        (1.0 / (1.0 + decay * f32::from(self.in_all))).max(MIN_MEAN_DECAY)
+    /// What a decay leaves of a rate at this update, 0 to 1: settled splats shall not follow each view.
+    pub(crate) fn share_of_rate(self, decay: f32) -> f32 {
+        (1.0 / (1.0 + decay * f32::from(self.in_all))).max(MIN_RATE_SHARE)
     }
 
     /// Updates of an SH band, this one included; `None`: it is not its turn yet.

@@ -11,6 +11,8 @@ use splat_types::transform::Rigid;
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const SPLAT_EPS: f64 = 1e-15;
+/// What a decay leaves of a rate at least.
+const MIN_RATE_SHARE: f64 = 0.01;
 const POSE_EPS: f64 = 1e-8;
 
 /// First and second moments, and how often each splat was updated. Above SH band 0, `m` is rounded to bf16, and the
@@ -51,8 +53,8 @@ impl SplatAdam {
         for &ix in visible {
             self.n_updates[ix] += 1;
             let t = self.n_updates[ix];
-            let settled =
-                (1.0 / (1.0 + f64::from(settings.lr_mean_decay) * f64::from(t))).max(0.01);
+            let settled = (1.0 / (1.0 + f64::from(settings.lr_mean_decay) * f64::from(t)))
+                .max(MIN_RATE_SHARE);
             for k in 0..3 {
                 let (m, v) = (&mut self.m.means[ix][k], &mut self.v.means[ix][k]);
                 params.means[ix][k] -= step(m, v, gradient.means[ix][k], t, SPLAT_EPS)
