@@ -91,7 +91,8 @@ fn settings_go_over_a_preset_and_a_preset_over_the_defaults() {
 }
 
 /// Keys whose default is another one since version 0.1.0.
-const NEW_DEFAULTS: [&str; 8] = [
+const NEW_DEFAULTS: [&str; 10] = [
+    "map.max_splats",
     "map.snapshot_secs",
     "mcmc.noise",
     "train.lr_mean",
@@ -99,6 +100,7 @@ const NEW_DEFAULTS: [&str; 8] = [
     "train.lr_quat",
     "train.lr_scale",
     "train.lr_sh",
+    "train.seeds_per_keyframe",
     "train.sh_degree",
 ];
 

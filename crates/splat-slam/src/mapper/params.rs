@@ -54,7 +54,7 @@ pub struct MapParams {
 impl Default for MapParams {
     fn default() -> Self {
         Self {
-            max_splats: 60000,
+            max_splats: 120_000,
             max_gpu_mib: 0,
             max_resident_keyframes: 400,
             max_page_file_mib: 8192,
@@ -156,7 +156,7 @@ impl Default for TrainParams {
             steps: 3000,
             max_side: 480,
             final_share: 0.5,
-            seeds_per_keyframe: 2500,
+            seeds_per_keyframe: 5000,
             sh_degree: 3,
             ssim_weight: 0.2,
             weights: LossWeights {
