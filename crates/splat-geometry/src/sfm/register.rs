@@ -15,6 +15,10 @@ use crate::sfm::reconstruction::{NONE, Reconstruction};
 /// down to half as many: an image of little texture has no more.
 const MIN_SHARE: f64 = 0.25;
 const MIN_SHARE_OF_FEW: f64 = 0.6;
+/// Candidate landmarks, in `Limits::min_inliers`, below which a view is compared with older ones before it is registered. A
+/// camera that comes back from elsewhere shares a few with the last keyframes, seen from far aside, and most with others: the
+/// few alone put it 5 % of the path off, at residuals of half a pixel.
+const CLEAR: usize = 3;
 /// Growth of a submap after which all its views are adjusted together.
 const GLOBAL_GROWTH: f64 = 1.3;
 /// Of fewer views that takes no longer than a few keyframes do, so that it is never left to another thread.
@@ -25,15 +29,25 @@ const MIN_SPREAD: f64 = 0.03;
 
 /// Places as many of the waiting views of `pool` as can be registered, and adjusts about each.
 pub(crate) fn grow(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    while let Some(registered) = register_best(scene, pool, limits) {
+    grow_by(scene, pool, limits, 0);
+}
+
+/// The same for views that share many landmarks with the submap.
+pub(crate) fn grow_clear(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
+    grow_by(scene, pool, limits, CLEAR * limits.min_inliers);
+}
+
+fn grow_by(scene: &mut Reconstruction, pool: &[usize], limits: &Limits, min_pairs: usize) {
+    while let Some(registered) = register_best(scene, pool, limits, min_pairs) {
         adjust_about(scene, &[registered], limits);
     }
 }
 
-/// The same sooner: the neighbourhood of the views is adjusted once, when all are registered.
+/// As `grow_clear`, and sooner: the neighbourhood of the views is adjusted once, when all are registered.
 pub(crate) fn grow_at_once(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
+    let min_pairs = CLEAR * limits.min_inliers;
     let registered: Vec<Registered> =
-        std::iter::from_fn(|| register_best(scene, pool, limits)).collect();
+        std::iter::from_fn(|| register_best(scene, pool, limits, min_pairs)).collect();
     adjust_about(scene, &registered, limits);
 }
 
@@ -49,8 +63,9 @@ fn register_best(
     scene: &mut Reconstruction,
     pool: &[usize],
     limits: &Limits,
+    min_pairs: usize,
 ) -> Option<Registered> {
-    while let Some((view, submap, pairs)) = best_waiting(scene, pool, limits) {
+    while let Some((view, submap, pairs)) = best_waiting(scene, pool, limits, min_pairs) {
         let n_pairs = pairs.len();
         let Some(cam_from_world) = pose(scene, view, &pairs, limits) else {
             scene.views[view].failed_with = n_pairs;
@@ -113,8 +128,13 @@ pub(crate) fn correspondences(
 
 type Waiting = (usize, u32, Vec<(u32, u32)>);
 
-/// The waiting view with most landmarks in one submap; one that failed needs a fifth more than then.
-fn best_waiting(scene: &Reconstruction, pool: &[usize], limits: &Limits) -> Option<Waiting> {
+/// The waiting view with most landmarks in one submap, `min_pairs` at least; one that failed needs a fifth more than then.
+fn best_waiting(
+    scene: &Reconstruction,
+    pool: &[usize],
+    limits: &Limits,
+    min_pairs: usize,
+) -> Option<Waiting> {
     let mut best: Option<Waiting> = None;
     for &view in pool
         .iter()
@@ -123,7 +143,8 @@ fn best_waiting(scene: &Reconstruction, pool: &[usize], limits: &Limits) -> Opti
         let Some((submap, n)) = best_submap(scene, view) else {
             continue;
         };
-        let needed = (limits.min_inliers / 2).max(scene.views[view].failed_with * 6 / 5 + 1);
+        let needed = (scene.views[view].failed_with * 6 / 5 + 1).max(min_pairs);
+        let needed = needed.max(limits.min_inliers / 2);
         if n >= needed && best.as_ref().is_none_or(|b| n > b.2.len()) {
             best = Some((view, submap, correspondences(scene, view, submap)));
         }
