@@ -29,12 +29,16 @@ const MIN_SPREAD: f64 = 0.03;
 
 /// Places as many of the waiting views of `pool` as can be registered, and adjusts about each.
 pub(crate) fn grow(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    grow_by(scene, pool, limits, 0);
+    grow_by(scene, pool, limits, limits.min_inliers / 2);
 }
 
 /// The same for views that share many landmarks with the submap.
 pub(crate) fn grow_clear(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    grow_by(scene, pool, limits, CLEAR * limits.min_inliers);
+    grow_by(scene, pool, limits, clear_pairs(limits));
+}
+
+fn clear_pairs(limits: &Limits) -> usize {
+    CLEAR * limits.min_inliers
 }
 
 fn grow_by(scene: &mut Reconstruction, pool: &[usize], limits: &Limits, min_pairs: usize) {
@@ -45,7 +49,7 @@ fn grow_by(scene: &mut Reconstruction, pool: &[usize], limits: &Limits, min_pair
 
 /// As `grow_clear`, and sooner: the neighbourhood of the views is adjusted once, when all are registered.
 pub(crate) fn grow_at_once(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    let min_pairs = CLEAR * limits.min_inliers;
+    let min_pairs = clear_pairs(limits);
     let registered: Vec<Registered> =
         std::iter::from_fn(|| register_best(scene, pool, limits, min_pairs)).collect();
     adjust_about(scene, &registered, limits);
@@ -65,7 +69,7 @@ fn register_best(
     limits: &Limits,
     min_pairs: usize,
 ) -> Option<Registered> {
-    while let Some((view, submap, pairs)) = best_waiting(scene, pool, limits, min_pairs) {
+    while let Some((view, submap, pairs)) = best_waiting(scene, pool, min_pairs) {
         let n_pairs = pairs.len();
         let Some(cam_from_world) = pose(scene, view, &pairs, limits) else {
             scene.views[view].failed_with = n_pairs;
@@ -129,12 +133,7 @@ pub(crate) fn correspondences(
 type Waiting = (usize, u32, Vec<(u32, u32)>);
 
 /// The waiting view with most landmarks in one submap, `min_pairs` at least; one that failed needs a fifth more than then.
-fn best_waiting(
-    scene: &Reconstruction,
-    pool: &[usize],
-    limits: &Limits,
-    min_pairs: usize,
-) -> Option<Waiting> {
+fn best_waiting(scene: &Reconstruction, pool: &[usize], min_pairs: usize) -> Option<Waiting> {
     let mut best: Option<Waiting> = None;
     for &view in pool
         .iter()
@@ -143,8 +142,7 @@ fn best_waiting(
         let Some((submap, n)) = best_submap(scene, view) else {
             continue;
         };
-        let needed = (scene.views[view].failed_with * 6 / 5 + 1).max(min_pairs);
-        let needed = needed.max(limits.min_inliers / 2);
+        let needed = min_pairs.max(scene.views[view].failed_with * 6 / 5 + 1);
         if n >= needed && best.as_ref().is_none_or(|b| n > b.2.len()) {
             best = Some((view, submap, correspondences(scene, view, submap)));
         }
