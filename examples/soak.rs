@@ -16,7 +16,9 @@ use rand_pcg::Pcg64Mcg;
 use splat_engine::cpu::engine::CpuEngine;
 use splat_engine::loss_weights::LossWeights;
 use splat_engine::mcmc::Relocation;
-use splat_engine::settings::{McmcSettings, PoseMode, PoseNetworkSettings, StepSettings};
+use splat_engine::settings::{
+    FirstEmbedding, McmcSettings, PoseMode, PoseNetworkSettings, StepSettings,
+};
 use splat_engine::traits::Engine;
 use splat_engine::view::TrainingView;
 use splat_engine::wgpu::engine::WgpuEngine;
@@ -76,6 +78,7 @@ fn main() -> anyhow::Result<()> {
                 max_splats: MAX_SPLATS,
                 growth: 1.05,
                 active_steps: 0,
+                keeps_age: false,
                 seed: n as u32,
             })?;
         }
@@ -202,6 +205,7 @@ fn set_up(engine: &mut dyn Engine) -> anyhow::Result<()> {
     }
     engine.replace(&splats)?;
     engine.start_pose_network(&PoseNetworkSettings {
+        embedding: FirstEmbedding::Order,
         seed: 1,
         camera_scale: 0.4,
     })?;

@@ -25,7 +25,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let at = 4u * splat_ix;
         let mean = geometry[at];
         // Most of a large map lies elsewhere: nothing more of those is read.
-        if in_camera(camera, mean.xyz).z > NEAR {
+        if in_camera(camera, mean.xyz).z > max(step.near, NEAR) {
             let size_px = vec2<f32>(f32(step.width_px), f32(step.height_px));
             let shape = shape_of(camera, mean, geometry[at + 1u], geometry[at + 2u].xyz, size_px);
             if shape.is_seen {

@@ -34,15 +34,18 @@ var<workgroup> sums: array<vec4<f32>, 256>;
 fn pixel_at(p: u32) -> Pixel {
     let given = depth_and_confidence(p % step.width_px, p / step.width_px);
     let depth = given.x;
-    let confidence = given.y * unpack4x8unorm(wanted[p]).w;
     let alpha = 1.0 - image[p].w;
-    if confidence <= 0.0 || alpha <= MIN_ALPHA_FOR_DEPTH {
+    // All pixels that have a depth and count, verified or not, whatever the map covers.
+    if depth <= 0.0 || unpack4x8unorm(wanted[p]).w <= 0.0 {
         return Pixel(false, alpha, 0.0, 0.0);
     }
     if step.depth_mode == PAPER_ALPHA {
         return Pixel(true, alpha, alpha, depth);
     }
     // 1 - minmax(1/d) is minmax(-1/d).
+    if alpha <= 0.0 {
+        return Pixel(true, alpha, 0.0, -1.0 / depth);
+    }
     return Pixel(true, alpha, depth_sum[p] / alpha, -1.0 / depth);
 }
 
@@ -55,6 +58,10 @@ fn put(p: u32, pixel: Pixel, v: f32) {
     var v_z = 0.0;
     var v_alpha = v;
     if step.depth_mode != PAPER_ALPHA {
+        // Where there is no splat there is nothing to move.
+        if pixel.alpha <= 0.0 {
+            return;
+        }
         v_z = v / pixel.alpha;
         v_alpha = -v * pixel.rendered / pixel.alpha;
     }

@@ -112,6 +112,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     geometry[at].w = log(copy.x / (1.0 - copy.x));
     let scale = geometry[at + 2u];
-    geometry[at + 2u] = vec4<f32>(scale.xyz + log(copy.y), 0.0);
     clear_moments(splat_ix);
+    let age = select(0.0, moments[8u * splat_ix + 4u].w, moves.keeps_age == 1u);
+    geometry[at + 2u] = vec4<f32>(scale.xyz + log(copy.y), age);
 }

@@ -57,6 +57,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let plane = step.width_px * step.height_px;
     let has_depth = (step.flags & FLAG_DEPTH) != 0u;
     let per_weight = 1.0 / max(3.0 * step.mask_sum, MIN_WEIGHT_SUM);
+    let ssim_weight = step.ssim_weight * step.ssim_share;
     var losses = vec4<f32>(0.0);
     var by_gain = vec3<f32>(0.0);
     var by_offset = vec3<f32>(0.0);
@@ -72,7 +73,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let compared = seen + camera.offset.xyz;
         let difference = compared - photo.xyz;
         let by_ssim = p + 2.0 * compared * q + photo.xyz * r;
-        let v = per_weight * ((1.0 - step.ssim_weight) * photo.w * sign(difference) - step.ssim_weight * by_ssim);
+        let v = per_weight * ((1.0 - step.ssim_weight) * photo.w * sign(difference) - ssim_weight * by_ssim);
         losses.x += photo.w * dot(abs(difference), vec3<f32>(1.0)) * per_weight;
         by_gain += v * seen;
         by_offset += v;

@@ -5,9 +5,7 @@
 #import step
 #import shape
 #import projected
-#import sh
-#import adam
-#import random
+#import splat_update
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> camera: Camera;
@@ -22,23 +20,7 @@
 // Three per group: rho and log focal; theta and visible splats; opacity and scale for the regularisers.
 @group(0) @binding(8) var<storage, read_write> pose_sums: array<vec4<f32>>;
 
-// Above it the noise is below 4e-9 of itself.
-const MAX_SHAKEN_OPACITY: f32 = 0.2;
-
 var<workgroup> sums: array<vec4<f32>, 768>;
-
-struct Gradient {
-    mean: vec3<f32>,
-    opacity_logit: f32,
-    quat: vec4<f32>,
-    log_scale: vec3<f32>,
-    base: vec3<f32>,
-    // 0 where it was clamped at black.
-    color: vec3<f32>,
-    rho: vec3<f32>,
-    log_focal: f32,
-    theta: vec3<f32>,
-}
 
 fn outer(a: vec3<f32>, b: vec3<f32>) -> mat3x3<f32> {
     return mat3x3<f32>(a * b.x, a * b.y, a * b.z);
@@ -125,12 +107,13 @@ fn gradient_of(visible_ix: u32, splat: Projected, shape: Shape, mean: vec3<f32>)
         dot(shape.rotation[1], g_root[1]),
         dot(shape.rotation[2], g_root[2]),
     );
-    let per_visible = 1.0 / f32(camera.n_visible);
-    let g_opacity = -sum0.x / shape.opacity + step.opacity_reg * per_visible;
+    let is_over_all = (step.flags & FLAG_ALL_SPLATS) != 0u;
+    let per_splat = 1.0 / f32(select(camera.n_visible, step.n_splats, is_over_all));
+    let g_opacity = -sum0.x / shape.opacity + step.opacity_reg * per_splat;
     g.mean = back * g_in_cam + by_direction;
     g.opacity_logit = g_opacity * shape.opacity * (1.0 - shape.opacity);
     g.quat = quat_gradient(shape, mat3x3<f32>(g_root[0] * shape.scale.x, g_root[1] * shape.scale.y, g_root[2] * shape.scale.z));
-    g.log_scale = shape.scale * (g_scale + step.scale_reg * per_visible / 3.0);
+    g.log_scale = shape.scale * (g_scale + step.scale_reg * per_splat / 3.0);
     g.rho = g_in_cam + to_cam * by_direction;
     let twist = cov * g_cov - g_cov * cov;
     g.theta = cross(shape.in_cam, g_in_cam) + 2.0 * vec3<f32>(twist[2].y, twist[0].z, twist[1].x);
@@ -139,111 +122,6 @@ fn gradient_of(visible_ix: u32, splat: Projected, shape: Shape, mean: vec3<f32>)
     let by_focal = f * shape.in_cam.xy / z * g_center + f / z * g_diagonal - f / z * shape.slope * g_slope - g_held * shape.slope;
     g.log_focal = by_focal.x + by_focal.y;
     return g;
-}
-
-fn updated(value: vec4<f32>, g: vec4<f32>, at: u32, rate: vec4<f32>, correction: vec2<f32>) -> vec4<f32> {
-    let m = BETA_1 * moments[at] + (1.0 - BETA_1) * g;
-    let v = BETA_2 * moments[at + 1u] + (1.0 - BETA_2) * g * g;
-    moments[at] = m;
-    moments[at + 1u] = v;
-    return value - rate * (m * correction.x) / (sqrt(v) * correction.y + SPLAT_EPS);
-}
-
-// bf16, round to nearest even.
-fn bf16_of(x: f32) -> u32 {
-    let bits = bitcast<u32>(x);
-    return (bits + 0x7fffu + ((bits >> 16u) & 1u)) >> 16u;
-}
-
-fn band_of(coefficient: u32) -> u32 {
-    return 1u + select(0u, 1u, coefficient >= 3u) + select(0u, 1u, coefficient >= 8u);
-}
-
-// All bands share their colour gradient; a band has one second moment, the mean over its coefficients and channels.
-// `since_cleared` counts the updates of the moments, `in_all` those of the splat and of what it was copied from.
-fn update_sh(splat_ix: u32, direction: vec3<f32>, g_color: vec3<f32>, since_cleared: u32, in_all: u32) {
-    let stored = n_sh_rest(step.sh_stored);
-    let words = (stored + 1u) / 2u;
-    let first_word = splat_ix * (words + step.sh_stored);
-    var basis = sh_basis(direction);
-    var factors = vec3<f32>(0.0);
-    var n_active = 0u;
-    for (var band = 1u; band <= step.sh_degree; band += 1u) {
-        let first_update = max(band * step.sh_interval, 1u);
-        if in_all < first_update {
-            break;
-        }
-        let correction = corrections(min(in_all - first_update + 1u, since_cleared));
-        let begin = band * band - 1u;
-        let end = begin + 2u * band + 1u;
-        var squares = 0.0;
-        for (var b = begin; b < end; b += 1u) {
-            squares += basis[b] * basis[b];
-        }
-        let mean = squares * dot(g_color, g_color) / f32(3u * (end - begin));
-        let at = first_word + words + band - 1u;
-        let v = BETA_2 * bitcast<f32>(sh_moments[at]) + (1.0 - BETA_2) * mean;
-        sh_moments[at] = bitcast<u32>(v);
-        factors[band - 1u] = correction.x / (sqrt(v) * correction.y + SPLAT_EPS);
-        n_active = 3u * end;
-    }
-    for (var word = 0u; 2u * word < n_active; word += 1u) {
-        let packed = sh_moments[first_word + word];
-        var halves = vec2<u32>(packed & 0xffffu, packed >> 16u);
-        for (var half = 0u; half < 2u; half += 1u) {
-            let k = 2u * word + half;
-            if k < n_active {
-                let g = basis[k / 3u] * g_color[k % 3u];
-                let m = BETA_1 * bitcast<f32>(halves[half] << 16u) + (1.0 - BETA_1) * g;
-                halves[half] = bf16_of(m);
-                sh_rest[splat_ix * stored + k] -= step.lr_sh_rest * m * factors[band_of(k / 3u) - 1u];
-            }
-        }
-        sh_moments[first_word + word] = halves.x | (halves.y << 16u);
-    }
-}
-
-// SGLD (Kheradmand et al. 2024, eq. 9): only what is nearly transparent moves, along its own covariance.
-fn shaken(splat_ix: u32, mean: vec3<f32>, opacity_logit: f32, quat: vec4<f32>, log_scale: vec3<f32>) -> vec3<f32> {
-    let opacity = 1.0 / (1.0 + exp(-opacity_logit));
-    let gate = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
-    if opacity > MAX_SHAKEN_OPACITY {
-        return mean;
-    }
-    let axes = rotation_of(normalize(quat));
-    let scale = exp(log_scale);
-    let along = (normal3(step.noise_seed, step.n_steps, splat_ix) * axes) * scale * scale;
-    return mean + step.noise * gate * (axes * along);
-}
-
-fn update_splat(splat_ix: u32, direction: vec3<f32>, g: Gradient) {
-    let at = 4u * splat_ix;
-    let base = geometry[at + 3u];
-    let scale = geometry[at + 2u];
-    let age = u32(scale.w) + 1u;
-    let correction = corrections(age);
-    let m = 8u * splat_ix;
-    let in_all = moments[m + 4u].w + 1.0;
-    let lr_mean = step.lr_mean * max(1.0 / (1.0 + step.lr_mean_decay * in_all), MIN_RATE_SHARE);
-    let position_rates = vec4<f32>(vec3<f32>(lr_mean), step.lr_opacity);
-    var mean = updated(geometry[at], vec4<f32>(g.mean, g.opacity_logit), m, position_rates, correction);
-    let quat = updated(geometry[at + 1u], g.quat, m + 2u, vec4<f32>(step.lr_quat), correction);
-    let log_scale = updated(vec4<f32>(scale.xyz, 0.0), vec4<f32>(g.log_scale, 0.0), m + 4u, vec4<f32>(step.lr_scale), correction).xyz;
-    let color = updated(vec4<f32>(base.xyz, 0.0), vec4<f32>(g.base, 0.0), m + 6u, vec4<f32>(step.lr_sh0), correction).xyz;
-    moments[m + 4u].w = in_all;
-    if step.noise > 0.0 {
-        let moved = shaken(splat_ix, mean.xyz, mean.w, quat, log_scale);
-        if is_finite3(moved) {
-            mean = vec4<f32>(moved, mean.w);
-        }
-    }
-    geometry[at] = mean;
-    geometry[at + 1u] = quat;
-    geometry[at + 2u] = vec4<f32>(log_scale, f32(age));
-    geometry[at + 3u] = vec4<f32>(color, f32(step.n_steps));
-    if step.sh_degree > 0u {
-        update_sh(splat_ix, direction, g.color, age, u32(in_all));
-    }
 }
 
 fn write_gradient(splat_ix: u32, direction: vec3<f32>, g: Gradient) {

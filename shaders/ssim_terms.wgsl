@@ -62,7 +62,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let by_mean = 2.0 * (my * n2 * inverse - mx * s / d1);
         let by_xx = -s / d2;
         let by_xy = 2.0 * n1 * inverse;
-        let weight = unpack4x8unorm(wanted[at]).w;
+        let y = u32(first + $j);
+        let margin = step.ssim_margin;
+        let is_inside = x >= margin && x + margin < step.width_px && y >= margin && y + margin < step.height_px;
+        let weight = select(0.0, unpack4x8unorm(wanted[at]).w, is_inside);
         terms[at] = vec4<f32>(weight * (by_mean - 2.0 * mx * by_xx - my * by_xy), 0.0);
         terms[plane + at] = vec4<f32>(weight * by_xx, 0.0);
         terms[2u * plane + at] = vec4<f32>(weight * by_xy, 0.0);

@@ -64,7 +64,7 @@ fn add_up(lane: u32) {
 
 fn note_stats() {
     let mask = 3.0 * step.mask_sum;
-    let ssim = select(1.0, totals[6].x / mask, mask > 0.0);
+    let ssim = select(1.0, step.ssim_share * totals[6].x / mask, mask > 0.0 && step.ssim_share > 0.0);
     let n = max(totals[2].z, 1.0);
     let regulariser = step.opacity_reg * totals[2].x / n + step.scale_reg * totals[2].y / (3.0 * n);
     let loss = (1.0 - step.ssim_weight) * totals[3].x + step.ssim_weight * (1.0 - ssim)

@@ -15,7 +15,8 @@ struct Moves {
     min_opacity: f32,
     // What copies keep: 1 the sums over the image, 0 what a line gathers.
     by_image: u32,
-    padding_0: u32,
+    // 1: moments count as old as their splat, though they were cleared.
+    keeps_age: u32,
     padding_1: u32,
 }
 

@@ -35,6 +35,12 @@ struct Step {
     noise: f32,
     noise_seed: u32,
     ssim_weight: f32,
+    // All pixels' weight over that of the pixels that SSIM is averaged over; 0: over none.
+    ssim_share: f32,
+    // Pixels at each edge that it leaves out.
+    ssim_margin: u32,
+    // Splats nearer than this are not drawn.
+    near: f32,
     // Weights of the loss's terms, as loss_weights.rs of splat-engine declares them.
 #import loss_weights
     // Sum of the pixels' weights, and of their depth confidences.
@@ -57,6 +63,8 @@ const FLAG_POSE_DIRECT: u32 = 4u;
 const FLAG_POSE_SHARED: u32 = 8u;
 const FLAG_DEPTH: u32 = 16u;
 const FLAG_POSE_NETWORK: u32 = 32u;
+// Also splats that the view does not see are moved.
+const FLAG_ALL_SPLATS: u32 = 64u;
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

@@ -154,6 +154,10 @@ impl<E: Engine, H: Hooks<E>> ViewStore for Hooked<H, E> {
 }
 
 impl<E: Engine, H: Hooks<E>> Renderer for Hooked<H, E> {
+    fn set_near(&mut self, near: f32) {
+        self.inner.set_near(near);
+    }
+
     fn render(
         &mut self,
         intrinsics: &Intrinsics,

@@ -75,6 +75,7 @@ fn moving_the_dead_of_a_trained_map_changes_its_images_by_a_quarter_of_a_grey_le
                 max_splats: 1_000_000,
                 growth,
                 active_steps: 0,
+                keeps_age: false,
                 seed: 7,
             })
             .unwrap();

@@ -107,6 +107,9 @@ fn the_step_has_the_layout_of_the_host() {
         noise,
         noise_seed,
         ssim_weight,
+        ssim_share,
+        ssim_margin,
+        near,
         mask_sum,
         confidence_sum,
         camera_scale,
@@ -185,7 +188,7 @@ fn other_shared_structs_have_the_layout_of_the_host() {
         sh_stored,
         min_opacity,
         by_image,
-        padding_0,
+        keeps_age,
         padding_1
     );
     assert_eq!(layout_in("Moves", &kernel("move_draw")), moves);

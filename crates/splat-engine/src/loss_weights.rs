@@ -49,10 +49,10 @@ macro_rules! loss_weights {
 loss_weights! {
     /// Weight of the depth loss; decays to a tenth over the run.
     depth_weight,
-    /// Weight of the mean opacity over the visible splats (3DGS-MCMC regulariser); the mapper's `mcmc.opacity_reg`.
+    /// Weight of the mean opacity over the visible splats, or over all with `all_splats` (3DGS-MCMC regulariser); the mapper's `mcmc.opacity_reg`.
     #[serde(skip)]
     opacity_reg,
-    /// Weight of the mean scale over the visible splats, per world unit (3DGS-MCMC regulariser); the mapper's `mcmc.scale_reg`.
+    /// Weight of the mean scale over the same splats, per world unit (3DGS-MCMC regulariser); the mapper's `mcmc.scale_reg`.
     #[serde(skip)]
     scale_reg,
 }

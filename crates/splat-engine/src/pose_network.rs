@@ -10,7 +10,7 @@ use glam::{DMat3, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::settings::PoseNetworkSettings;
+use crate::settings::{FirstEmbedding, PoseNetworkSettings};
 use splat_types::transform::{Rigid, skew};
 
 /// Numbers of a view's embedding, and of each hidden layer (3R-GS).
@@ -57,8 +57,11 @@ pub type Embedding = [f32; WIDTH];
 /// What is known of a view at its start: its place in the order of arrival, as waves from `FIRST_WAVE` views long, each twice
 /// as long as the one before. So the network's motions are smooth along the way, as drift is; with zeros (3R-GS) all views would
 /// have to move alike until they had been distinguished.
-pub fn first_embedding(view_ix: usize) -> Embedding {
+pub fn first_embedding(kind: FirstEmbedding, view_ix: usize) -> Embedding {
     let mut embedding = [0.0; WIDTH];
+    if kind == FirstEmbedding::Zero {
+        return embedding;
+    }
     let (waves, _) = embedding.as_chunks_mut::<2>();
     let mut length = FIRST_WAVE;
     for wave in &mut waves[..N_WAVES] {
@@ -84,6 +87,8 @@ pub struct PoseNetwork {
     pub parameters: Vec<f32>,
     /// World units that an output of 1 moves a camera by.
     pub camera_scale: f64,
+    /// What embeddings of new views are at first.
+    pub embedding: FirstEmbedding,
     moments: Moments,
 }
 
@@ -121,6 +126,7 @@ impl PoseNetwork {
         Self {
             parameters,
             camera_scale: f64::from(settings.camera_scale),
+            embedding: settings.embedding,
             moments: Moments::default(),
         }
     }

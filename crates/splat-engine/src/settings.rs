@@ -27,11 +27,23 @@ pub enum PoseMode {
     Shared,
 }
 
+/// What the pose network knows of a view before anything was learnt.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum FirstEmbedding {
+    /// Its place in the order of arrival, as waves: neighbours along the way move alike, as drift does.
+    #[default]
+    Order,
+    /// Nothing, as in 3R-GS: zeros. All cameras move alike until steps have told them apart.
+    Zero,
+}
+
 /// The network that moves all poses together; see `pose_network`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseNetworkSettings {
     /// Of the first values of its hidden layers.
     pub seed: u64,
+    /// What the embeddings of the views are at first.
+    pub embedding: FirstEmbedding,
     /// World units that an output of 1 moves a camera by: RMS distance of the cameras to their mean.
     pub camera_scale: f32,
 }
@@ -49,6 +61,9 @@ pub struct McmcSettings {
     pub growth: f32,
     /// Only splats that one of the last so many steps has seen take part; 0: all.
     pub active_steps: u32,
+    /// Moved splats and their sources are bias-corrected by all steps so far, as where a whole attribute has one counter (gsplat);
+    /// else by those since their moments were cleared.
+    pub keeps_age: bool,
     /// Different in every pass.
     pub seed: u32,
 }
@@ -78,6 +93,12 @@ pub struct StepSettings {
     pub lr_pose_translation: f32,
     /// Share of 1 - SSIM in the photometric loss, 0 to 1; the rest is L1. 0.2 in 3DGS.
     pub ssim_weight: f32,
+    /// SSIM is averaged over the pixels whose whole window lies in the image ("valid" padding, as in FastSplatting and gsplat); else
+    /// over all, with black beyond the edges.
+    pub ssim_valid: bool,
+    /// Adam's moments, regularisers and noise move all splats, as in 3DGS-MCMC, and not only those that the view sees. The
+    /// regularisers are means over all then.
+    pub all_splats: bool,
     /// Adam rate of the shared network and of the views' embeddings.
     pub lr_pose_network: f32,
     /// Adam rate of the logarithm of the factor on all focal lengths; 0 holds it.

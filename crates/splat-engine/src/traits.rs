@@ -120,6 +120,10 @@ pub trait ViewStore {
 
 /// Splats -> image.
 pub trait Renderer {
+    /// From now on splats nearer than this to a camera are neither drawn nor trained, world units; [`NEAR`](crate::view::NEAR) at
+    /// least, which it is at first. FastSplatting has 0.05 of the scene's extent.
+    fn set_near(&mut self, near: f32);
+
     /// Renders with SH up to the given degree on a black background, after all steps so far. `cam_from_world` need not be a view's. Exposures
     /// of views have no part in it.
     fn render(

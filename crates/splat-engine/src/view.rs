@@ -7,6 +7,13 @@ use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
 
+/// Splats closer than this to a camera are not drawn unless an engine is told of a farther plane, world units; the map's unit is about
+/// the median scene depth.
+pub const NEAR: f32 = 0.01;
+
+/// Pixels that the window of SSIM reaches to each side.
+pub(crate) const SSIM_REACH: u32 = 5;
+
 /// An image to train on, or an unloaded one, which no step may have. Index in the engine = order of
 /// [`ViewStore::add_view`](crate::traits::ViewStore::add_view). Without lens distortion.
 #[derive(Debug, Clone)]

@@ -17,15 +17,15 @@ use splat_types::splats::splats::Splats;
 /// Adam's state of all splats, and how long they have been there.
 #[derive(Debug, Default)]
 pub(crate) struct Optimiser {
-    means: Moments,
-    log_scales: Moments,
-    quats: Moments,
-    opacity_logits: Moments,
-    sh_band_0: Moments,
-    sh_above: ShMoments,
-    update_counts: Vec<UpdateCounts>,
+    pub(crate) means: Moments,
+    pub(crate) log_scales: Moments,
+    pub(crate) quats: Moments,
+    pub(crate) opacity_logits: Moments,
+    pub(crate) sh_band_0: Moments,
+    pub(crate) sh_above: ShMoments,
+    pub(crate) update_counts: Vec<UpdateCounts>,
     /// Number of the step that last saw the splat, or brought it.
-    last_seen: Vec<u32>,
+    pub(crate) last_seen: Vec<u32>,
     /// Of the visible splats, after the update; `None`: left alone.
     updated: Vec<Option<UpdateCounts>>,
 }
@@ -80,6 +80,12 @@ impl Optimiser {
             moments.second[ix * stride..(ix + 1) * stride].fill(0.0);
         }
         self.sh_above.clear(sh_stride, ix);
+    }
+
+    /// The moments of splat `ix` count as old as it is.
+    pub(crate) fn keep_age(&mut self, ix: usize) {
+        let counts = &mut self.update_counts[ix];
+        counts.since_cleared = counts.in_all;
     }
 
     /// Makes splat `to` as old as `from`, from which it was copied.
@@ -262,7 +268,7 @@ fn adam(attribute: Attribute<'_>, projected: &Projected, updated: &[Option<Updat
     "x86_64+avx2+fma",
     "aarch64+neon"
 ))]
-fn update(
+pub(crate) fn update(
     params: &mut [f32],
     (first, second): (&mut [f32], &mut [f32]),
     grads: &[f32],

@@ -109,6 +109,48 @@ impl ShMoments {
     }
 }
 
+impl ShMoments {
+    /// Of splats that a view does not show, one entry each, by momentum alone; `None`: left alone.
+    pub(crate) fn update_unseen(
+        &mut self,
+        splats: &mut Splats,
+        unseen: &[Option<UpdateCounts>],
+        settings: &StepSettings,
+    ) {
+        let stride = splats.sh_stride();
+        let (n_first, n_second) = (stride - BAND_0, n_bands(stride));
+        let n_active = usize::from(settings.sh_degree.min(splats.sh_degree));
+        if n_active == 0 {
+            return;
+        }
+        let zeros = vec![0.0; n_first];
+        let rows = (
+            splats.sh.par_chunks_exact_mut(stride),
+            self.first.par_chunks_exact_mut(n_first),
+            self.second.par_chunks_exact_mut(n_second),
+            unseen.par_iter(),
+        );
+        let rows = rows.into_par_iter().with_min_len(CHUNK);
+        rows.for_each(|(params, first, second, update_counts)| {
+            let Some(update_counts) = *update_counts else {
+                return;
+            };
+            let row = Row {
+                params: &mut params[BAND_0..],
+                first,
+                second: &mut second[..n_active],
+                grads: &zeros,
+            };
+            update(
+                row,
+                update_counts,
+                settings.sh_interval,
+                settings.lr_sh_rest,
+            );
+        });
+    }
+}
+
 /// One splat's bands above 0.
 struct Row<'a> {
     params: &'a mut [f32],

@@ -115,6 +115,10 @@ impl CpuEngine {
             n_skipped += self
                 .optimiser
                 .update(splats, seen, g, settings, self.n_trained);
+            if settings.all_splats {
+                self.optimiser
+                    .update_unseen(splats, settings, self.n_trained);
+            }
             crate::cpu::mcmc::add_noise(splats, seen, settings, self.n_trained);
         }
         self.count_troubles(n_skipped);

@@ -51,7 +51,8 @@ pub fn loss(
         return LossValue::default();
     }
     let weight = f64::from(settings.ssim_weight);
-    let mut value = photo_loss(raster, target, weight, out);
+    let margin = if settings.ssim_valid { REACH } else { 0 };
+    let mut value = photo_loss(raster, target, (weight, margin), out);
     value.depth = match target.depth {
         Some(depth) if settings.weights.depth_weight > 0.0 => {
             depth_gradient(raster, depth, settings, out)
@@ -67,11 +68,11 @@ pub fn loss(
     value
 }
 
-/// Fills r, g, b of the gradient.
+/// Fills r, g, b of the gradient. SSIM is averaged over pixels that are `margin` away from the image's edges.
 fn photo_loss(
     raster: &Raster,
     target: &Target<'_>,
-    ssim_weight: f64,
+    (ssim_weight, margin): (f64, usize),
     out: &mut PixelGradients,
 ) -> LossValue {
     let mut value = LossValue::default();
@@ -82,20 +83,45 @@ fn photo_loss(
         value.ssim = 1.0;
         return value;
     }
-    let weights = [((1.0 - ssim_weight) / n) as f32, (-ssim_weight / n) as f32];
+    let n_ssim = match margin {
+        0 => n,
+        _ => 3.0 * sum_within(&out.scratch.weights, raster, margin),
+    };
+    let per_ssim = if n_ssim > 0.0 { 1.0 / n_ssim } else { 0.0 };
+    let weights = [
+        ((1.0 - ssim_weight) / n) as f32,
+        (-ssim_weight * per_ssim) as f32,
+    ];
     let [gains, offsets] = target.exposure;
     for channel in 0..3 {
         let exposure = [gains[channel].exp(), offsets[channel]];
         load_target(target.image, channel, raster, &mut out.scratch);
         expose(raster, channel, exposure, &mut out.scratch);
         blur_moments(raster, &mut out.scratch);
-        value.ssim += blur_terms(raster, target.mask.is_some(), &mut out.scratch) / n;
+        let is_weighted = target.mask.is_some();
+        value.ssim += blur_terms(raster, (is_weighted, margin), &mut out.scratch) * per_ssim;
         let [l1, by_gain, by_offset] = photo_gradient(raster, channel, exposure, weights, out);
         value.l1 += l1 / n;
         value.exposure[0][channel] = by_gain;
         value.exposure[1][channel] = by_offset;
     }
+    if n_ssim == 0.0 {
+        value.ssim = 1.0;
+    }
     value
+}
+
+/// Of the pixels that are `margin` away from the edges.
+fn sum_within(weights: &[f32], raster: &Raster, margin: usize) -> f64 {
+    let (width, height) = (raster.width_px, raster.height_px);
+    let rows = margin..height.saturating_sub(margin);
+    let of_row = |y: usize| {
+        let row = weights.get(y * width + margin..(y + 1) * width - margin);
+        let row = row.unwrap_or_default().iter();
+        row.map(|weight| f64::from(*weight)).sum::<f64>()
+    };
+    let is_wide = width > 2 * margin;
+    rows.filter(|_| is_wide).map(of_row).sum()
 }
 
 /// Returns the sum of the weights.
@@ -168,9 +194,10 @@ fn blur_moments(raster: &Raster, scratch: &mut Scratch) {
         });
 }
 
-/// Finishes the blur of the moments, and starts the one of the derivatives. Returns the weighted sum of SSIM.
-fn blur_terms(raster: &Raster, is_weighted: bool, scratch: &mut Scratch) -> f64 {
-    let (stride, width) = (raster.stride, raster.width_px);
+/// Finishes the blur of the moments, and starts the one of the derivatives. Returns the weighted sum of SSIM over the pixels that
+/// are `margin` away from the edges; the others have no say.
+fn blur_terms(raster: &Raster, (is_weighted, margin): (bool, usize), scratch: &mut Scratch) -> f64 {
+    let (stride, width, height) = (raster.stride, raster.width_px, raster.height_px);
     let Scratch {
         moments,
         terms: [p, q, r, s, spare],
@@ -208,10 +235,18 @@ fn blur_terms(raster: &Raster, is_weighted: bool, scratch: &mut Scratch) -> f64 
                     rows.each_mut().map(|row| &mut row[PLANE_MARGIN..][..width]);
                 ssim::terms_in_place(p, q, r, s, spare);
                 if is_weighted {
-                    for row in [p, q, r, &mut *s] {
+                    for row in [&mut *p, &mut *q, &mut *r, &mut *s] {
                         row.iter_mut()
                             .zip(weights)
                             .for_each(|(x, weight)| *x *= weight);
+                    }
+                }
+                if margin > 0 {
+                    let is_inside = (margin..height.saturating_sub(margin)).contains(&y);
+                    let sides = if is_inside { margin.min(width) } else { width };
+                    for row in [&mut *p, &mut *q, &mut *r, &mut *s] {
+                        row[..sides].fill(0.0);
+                        row[width - sides..].fill(0.0);
                     }
                 }
                 sum[0] = sum_of([s], |[s]| s);

@@ -122,10 +122,26 @@ impl Targets<'_> {
             is_usable.then_some((depth, confidence))
         })
     }
+
+    /// The same whatever the confidence, where the pixel counts at all.
+    fn depths_of_row(&self, y: usize) -> impl Iterator<Item = Option<f32>> + '_ {
+        let map = self.map;
+        let (map_width, map_height) = (map.width_px as usize, map.height_px as usize);
+        let map_y = (2 * y + 1) * map_height / (2 * self.height_px);
+        let row = map_y * map_width..(map_y + 1) * map_width;
+        let is_whole = map.confidence.len() >= row.end;
+        let depths = map.depth.get(row).filter(|_| is_whole).unwrap_or_default();
+        let weights = &self.weights[y * self.map_columns.len()..];
+        self.map_columns.iter().zip(weights).map(|(&x, &weight)| {
+            let depth = *depths.get(x)?;
+            let is_usable = depth > 0.0 && depth.is_finite() && weight > 0.0;
+            is_usable.then_some(depth)
+        })
+    }
 }
 
-/// Mean difference of two images, each stretched to 0..1 over the pixels that have both. On one thread: this is for
-/// comparison with the paper, and a hundredth of a step.
+/// Mean difference of two images, each stretched to 0..1 over all pixels that have a depth, verified or not, whatever the map
+/// covers: so FastSplatting has it. On one thread: this is for comparison with the paper, and a hundredth of a step.
 fn stretched_gradient(
     raster: &Raster,
     map: &DepthMap,
@@ -153,8 +169,11 @@ fn stretched_gradient(
             v_alpha[at] += v;
         } else {
             let alpha = raster.planes[3][at];
-            v_depth_sum[at] += v / alpha;
-            v_alpha[at] -= v * pixel.rendered / alpha;
+            // Where there is no splat there is nothing to move.
+            if alpha > 0.0 {
+                v_depth_sum[at] += v / alpha;
+                v_alpha[at] -= v * pixel.rendered / alpha;
+            }
         }
     };
     let (mut sum, mut v_low, mut v_high) = (0.0, 0.0, 0.0);
@@ -173,7 +192,7 @@ fn stretched_gradient(
     sum / pixels.len() as f64
 }
 
-/// Pixels of enough alpha that have a target. 1 - minmax(1/d) is minmax(-1/d).
+/// Pixels that have a target. 1 - minmax(1/d) is minmax(-1/d).
 fn collect(raster: &Raster, map: &DepthMap, is_alpha: bool, scratch: &mut Scratch) {
     let targets = Targets {
         map,
@@ -184,15 +203,14 @@ fn collect(raster: &Raster, map: &DepthMap, is_alpha: bool, scratch: &mut Scratc
     scratch.stretched.clear();
     for y in 0..raster.height_px {
         let (alpha, depth_sum) = (raster.row(3, y), raster.row(4, y));
-        for (x, target) in targets.of_row(y).enumerate() {
-            let Some((depth, _)) = target else { continue };
-            if alpha[x] <= MIN_ALPHA_FOR_DEPTH {
-                continue;
-            }
+        for (x, target) in targets.depths_of_row(y).enumerate() {
+            let Some(depth) = target else { continue };
             let (rendered, wanted) = if is_alpha {
                 (alpha[x], depth)
-            } else {
+            } else if alpha[x] > 0.0 {
                 (depth_sum[x] / alpha[x], -1.0 / depth)
+            } else {
+                (0.0, -1.0 / depth)
             };
             scratch.stretched.push(Stretched {
                 x,

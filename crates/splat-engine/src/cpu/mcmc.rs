@@ -112,10 +112,13 @@ impl Moves<'_> {
         let by = factor.ln();
         self.splats.log_scales[ix].iter_mut().for_each(|l| *l += by);
         self.optimiser.clear(self.splats.sh_stride(), ix);
+        if self.settings.keeps_age {
+            self.optimiser.keep_age(ix);
+        }
     }
 }
 
-/// Noise on the means of the splats that step `now` has seen.
+/// Noise on the means of the splats that step `now` has seen, or of all.
 pub(crate) fn add_noise(splats: &mut Splats, seen: &Projected, settings: &StepSettings, now: u32) {
     if settings.noise <= 0.0 || settings.noise.is_nan() {
         return;
@@ -124,8 +127,17 @@ pub(crate) fn add_noise(splats: &mut Splats, seen: &Projected, settings: &StepSe
     let logits = &splats.opacity_logits;
     let chunks = splats.means.par_chunks_mut(CHUNK).enumerate();
     chunks.for_each(|(c, means)| {
-        for v in seen.of_chunk(c) {
-            let ix = seen.splats[v].splat_ix as usize;
+        let of_chunk = if settings.all_splats {
+            0..means.len()
+        } else {
+            seen.of_chunk(c)
+        };
+        for v in of_chunk {
+            let ix = if settings.all_splats {
+                c * CHUNK + v
+            } else {
+                seen.splats[v].splat_ix as usize
+            };
             let opacity = sigmoid(logits[ix]);
             let Some(quat) = unit(quats[ix]) else {
                 continue;

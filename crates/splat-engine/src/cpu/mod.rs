@@ -45,6 +45,8 @@ mod adam_sh;
 
 mod adam;
 
+mod adam_unseen;
+
 mod mcmc;
 
 pub mod engine;

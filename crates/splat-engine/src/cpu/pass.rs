@@ -15,6 +15,8 @@ use splat_types::splats::splats::Splats;
 /// Buffers of one way there and back.
 #[derive(Debug, Default)]
 pub(crate) struct Pass {
+    /// Splats nearer than this are left out, world units; never less than `project::NEAR`.
+    pub(crate) near: f64,
     pub(crate) projected: Projected,
     pub(crate) tiles: Tiles,
     pub(crate) raster: Raster,
@@ -42,7 +44,7 @@ impl Pass {
         exposure: Exposure,
         settings: &StepSettings,
     ) -> LossValue {
-        let camera = Camera::new(&view.intrinsics, &view.cam_from_world);
+        let camera = Camera::new(&view.intrinsics, &view.cam_from_world).with_near(self.near);
         self.render(splats, &camera, settings.sh_degree);
         let visible = &self.projected.splats;
         let target = Target {

@@ -11,7 +11,7 @@ use splat_types::camera::Intrinsics;
 use splat_types::splats::splats::Splats;
 use splat_types::transform::Rigid;
 
-/// Splats closer than this are culled; the map's unit is about the median scene depth.
+/// Splats closer than this are culled at least; as `view::NEAR`.
 pub const NEAR: f64 = 0.01;
 /// Added to the 2D covariance, px^2: a splat is never thinner than about half a pixel (Kerbl et al. 2023).
 pub const EPS_2D_PX2: f64 = 0.3;
@@ -43,6 +43,8 @@ pub struct Camera {
     /// Bounds of x/z and y/z in the Jacobian: far outside the image the linearisation explodes.
     slope_min: DVec2,
     slope_max: DVec2,
+    /// Splats closer than this are culled.
+    near: f64,
 }
 
 /// One visible splat on the image; a cache line, since tiles fetch them in no order.
@@ -238,6 +240,15 @@ impl Camera {
             center_in_world,
             slope_min: -(principal / focal + beyond),
             slope_max: (size - principal) / focal + beyond,
+            near: NEAR,
+        }
+    }
+
+    /// Culls what is nearer than this.
+    pub(crate) fn with_near(self, near: f64) -> Self {
+        Self {
+            near: near.max(NEAR),
+            ..self
         }
     }
 
@@ -259,7 +270,7 @@ impl Shape {
         camera: &Camera,
     ) -> Option<Self> {
         let p = camera.rotation * vec3(mean) + camera.translation;
-        if !(p.z > NEAR && p.is_finite()) {
+        if !(p.z > camera.near && p.is_finite()) {
             return None;
         }
         let scale = vec3(log_scale.map(f32::exp));

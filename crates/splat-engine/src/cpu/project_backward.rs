@@ -167,10 +167,14 @@ impl Forward<'_> {
         let g_rotation = g_root * DMat3::from_diagonal(shape.scale);
 
         let opacity = f64::from(sigmoid(self.splats.opacity_logits[ix]));
-        let n_visible = self.visible.len() as f64;
+        let n_regularised = if settings.all_splats {
+            self.splats.len() as f64
+        } else {
+            self.visible.len() as f64
+        };
         let g_opacity =
-            f64::from(sums.opacity) + f64::from(settings.weights.opacity_reg) / n_visible;
-        let g_scale = g_scale + f64::from(settings.weights.scale_reg) / (3.0 * n_visible);
+            f64::from(sums.opacity) + f64::from(settings.weights.opacity_reg) / n_regularised;
+        let g_scale = g_scale + f64::from(settings.weights.scale_reg) / (3.0 * n_regularised);
         partial.opacity += opacity;
         partial.scale += shape.scale.element_sum();
 

@@ -182,17 +182,18 @@ impl ViewStore for CpuEngine {
 }
 
 impl Renderer for CpuEngine {
+    fn set_near(&mut self, near: f32) {
+        self.pass.near = f64::from(near);
+    }
+
     fn render(
         &mut self,
         intrinsics: &Intrinsics,
         cam_from_world: &Rigid,
         sh_degree: u8,
     ) -> Result<Rendering, EngineError> {
-        self.pass.render(
-            &self.splats,
-            &Camera::new(intrinsics, cam_from_world),
-            sh_degree,
-        );
+        let camera = Camera::new(intrinsics, cam_from_world).with_near(self.pass.near);
+        self.pass.render(&self.splats, &camera, sh_degree);
         Ok(self.pass.raster.rendering())
     }
 }
@@ -221,11 +222,11 @@ impl Trainer for CpuEngine {
     }
 
     fn start_pose_network(&mut self, settings: &PoseNetworkSettings) -> Result<(), EngineError> {
-        let old = self.pose_network.take();
+        let (old, new) = (self.pose_network.take(), PoseNetwork::new(settings));
         for (ix, view) in self.views.iter_mut().enumerate() {
-            view.fold(ix, old.as_ref());
+            view.fold(ix, old.as_ref(), &new);
         }
-        self.pose_network = Some(PoseNetwork::new(settings));
+        self.pose_network = Some(new);
         Ok(())
     }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use crate::cpu::exposure::{Exposure, ExposureAdam};
 use crate::cpu::pose_adam::PoseAdam;
 use crate::pose_network::{Embedding, Moments, PoseNetwork, first_embedding};
-use crate::settings::StepSettings;
+use crate::settings::{FirstEmbedding, StepSettings};
 use crate::view::{Correspondence, TrainingView};
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
@@ -29,7 +29,7 @@ impl View {
     pub(crate) fn new(view: TrainingView, ix: usize, pose_network: Option<&PoseNetwork>) -> Self {
         let mut new = Self {
             training: view,
-            embedding: first_embedding(ix),
+            embedding: first_embedding(kind_of(pose_network), ix),
             moments: Moments::default(),
             adam: PoseAdam::default(),
             matches: Vec::new(),
@@ -69,9 +69,9 @@ impl View {
     }
 
     /// What the old network did stays in the base; the new one starts from nothing.
-    pub(crate) fn fold(&mut self, ix: usize, old: Option<&PoseNetwork>) {
+    pub(crate) fn fold(&mut self, ix: usize, old: Option<&PoseNetwork>, new: &PoseNetwork) {
         self.training.cam_from_world = self.pose(old);
-        self.embedding = first_embedding(ix);
+        self.embedding = first_embedding(new.embedding, ix);
         self.moments = Moments::default();
     }
 
@@ -144,4 +144,8 @@ impl View {
             }
         };
     }
+}
+
+fn kind_of(pose_network: Option<&PoseNetwork>) -> FirstEmbedding {
+    pose_network.map_or(FirstEmbedding::default(), |network| network.embedding)
 }

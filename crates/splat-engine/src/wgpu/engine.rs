@@ -7,6 +7,7 @@ use std::collections::VecDeque;
 
 use crate::error::EngineError;
 use crate::settings::StepSettings;
+use crate::view::NEAR;
 use crate::wgpu::frame::Frame;
 use crate::wgpu::memory::SplatMemory;
 use crate::wgpu::views::Views;
@@ -30,6 +31,8 @@ pub struct WgpuEngine {
     /// Steps that were to move splats.
     pub(crate) n_trained: u32,
     pub(crate) has_warned_of_room: bool,
+    /// Splats nearer than this are not drawn, world units.
+    pub(crate) near: f32,
 }
 
 impl WgpuEngine {
@@ -56,6 +59,7 @@ impl WgpuEngine {
             unconfirmed: VecDeque::new(),
             n_trained: 0,
             has_warned_of_room: false,
+            near: NEAR,
             gpu,
         })
     }

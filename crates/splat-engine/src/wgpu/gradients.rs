@@ -6,7 +6,8 @@ use crate::view::TrainingView;
 use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::passes;
 use crate::wgpu::types::{
-    Camera, FLAG_DEPTH, FLAG_GRADIENTS, Projected, Step, VIEW_EXPOSURE, VIEW_STRIDE,
+    Camera, FLAG_ALL_SPLATS, FLAG_DEPTH, FLAG_GRADIENTS, Projected, Step, VIEW_EXPOSURE,
+    VIEW_STRIDE,
 };
 use splat_gpu::commands::Commands;
 use splat_gpu::error::GpuError;
@@ -43,7 +44,7 @@ pub fn gradients(
         };
         let step = engine.step_of(view_ix, &settings, 0);
         let step = Step {
-            flags: FLAG_GRADIENTS | (step.flags & FLAG_DEPTH),
+            flags: FLAG_GRADIENTS | (step.flags & (FLAG_DEPTH | FLAG_ALL_SPLATS)),
             ..step
         };
         if let Some(found) = try_gradients(engine, view_ix, &step)? {

@@ -20,6 +20,7 @@ splat_gpu::kernels! {
         "sh",
         "shape",
         "sorting",
+        "splat_update",
         "ssim",
         "ssim_maps_blur",
         "ssim_maps_load",
@@ -76,6 +77,9 @@ splat_gpu::kernels! {
     PROJECT_BACKWARD "project_backward" 256 [
         step Uniform, camera Read, projected Read, splat_sums Read, geometry ReadWrite, moments ReadWrite,
         sh_rest ReadWrite, sh_moments ReadWrite, pose_sums ReadWrite,
+    ];
+    UPDATE_UNSEEN "update_unseen" 256 [
+        step Uniform, camera Read, geometry ReadWrite, moments ReadWrite, sh_rest ReadWrite, sh_moments ReadWrite,
     ];
     UPDATE_VIEW "update_view" 64 [
         step Uniform, camera Read, pose_sums Read, loss_sums Read, ssim_sums Read, views ReadWrite, network ReadWrite,

@@ -51,6 +51,7 @@ pub(crate) fn relocate_and_grow(
         sh_stored: u32::from(memory.sh_degree),
         min_opacity: settings.min_opacity,
         by_image: u32::from(settings.copies == mcmc::Relocation::Image),
+        keeps_age: u32::from(settings.keeps_age),
         kind: mcmc::RELOCATION,
         ..Moves::default()
     };

@@ -4,11 +4,12 @@ use crate::wgpu::frame::Frame;
 use crate::wgpu::kernels::{
     CULL, DEPTH_STRETCH, EMIT, GATHER, INSTANCE_ARGS, PHOTO_GRADIENT, PROJECT, PROJECT_BACKWARD,
     RANGES, RASTER, RASTER_BACKWARD, RASTER_BACKWARD_ATOMIC, SSIM_BACK, SSIM_ROWS, SSIM_TERMS,
-    TILE_COUNTS, UPDATE_VIEW, VIEW_CAMERA, VISIBLE_ARGS,
+    TILE_COUNTS, UPDATE_UNSEEN, UPDATE_VIEW, VIEW_CAMERA, VISIBLE_ARGS,
 };
 use crate::wgpu::memory::SplatMemory;
 use crate::wgpu::types::{
-    ARGS_INSTANCES, ARGS_SORT_INSTANCES, ARGS_SORT_VISIBLE, ARGS_VISIBLE, Step,
+    ARGS_INSTANCES, ARGS_SORT_INSTANCES, ARGS_SORT_VISIBLE, ARGS_VISIBLE, FLAG_ALL_SPLATS,
+    FLAG_GRADIENTS, Step,
 };
 use crate::wgpu::views::Views;
 use splat_gpu::buffer::Buffer;
@@ -196,7 +197,19 @@ pub(crate) fn backward(
         &memory.sh_moments,
         &s.pose_sums,
     ];
-    commands.dispatch_indirect(&PROJECT_BACKWARD, &project, &frame.args, ARGS_VISIBLE)
+    commands.dispatch_indirect(&PROJECT_BACKWARD, &project, &frame.args, ARGS_VISIBLE)?;
+    if step.flags & (FLAG_ALL_SPLATS | FLAG_GRADIENTS) != FLAG_ALL_SPLATS {
+        return Ok(());
+    }
+    let unseen = [
+        &frame.step,
+        &frame.camera,
+        geometry,
+        &memory.moments,
+        sh_rest,
+        &memory.sh_moments,
+    ];
+    commands.dispatch(&UPDATE_UNSEEN, &unseen, step.n_splats.div_ceil(256))
 }
 
 /// Gradients of the pixels -> those of each visible splat's 2D Gaussian.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::error::EngineError;
 use crate::settings::{McmcSettings, Memory, PoseNetworkSettings, StepSettings, StepStats};
 use crate::traits::{Device, Renderer, SplatBuffers, Trainer, ViewStore};
-use crate::view::{Correspondence, TrainingView};
+use crate::view::{Correspondence, NEAR, TrainingView};
 use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::{capacity, mcmc};
 use splat_types::camera::Intrinsics;
@@ -210,6 +210,10 @@ impl WgpuEngine {
 }
 
 impl Renderer for WgpuEngine {
+    fn set_near(&mut self, near: f32) {
+        self.near = near.max(NEAR);
+    }
+
     fn render(
         &mut self,
         intrinsics: &Intrinsics,

@@ -2,11 +2,12 @@
 
 use crate::epipolar::{self, Eye};
 use crate::settings::{DepthMode, PoseMode, StepSettings};
+use crate::view::SSIM_REACH;
 use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::passes;
 use crate::wgpu::types::{
-    Camera, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED, FLAG_TRAIN_SPLATS,
-    Step, TILE_PX,
+    Camera, FLAG_ALL_SPLATS, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED,
+    FLAG_TRAIN_SPLATS, Step, TILE_PX,
 };
 use splat_gpu::commands::Commands;
 use splat_gpu::error::GpuError;
@@ -150,7 +151,8 @@ impl WgpuEngine {
             | flag(s.moves_alone(), FLAG_POSE_DIRECT)
             | flag(s.pose == PoseMode::Shared, FLAG_POSE_SHARED)
             | flag(has_depth, FLAG_DEPTH)
-            | flag(self.views.pose_network.is_some(), FLAG_POSE_NETWORK);
+            | flag(self.views.pose_network.is_some(), FLAG_POSE_NETWORK)
+            | flag(s.train_splats && s.all_splats, FLAG_ALL_SPLATS);
         Step {
             view_ix: view_ix as u32,
             n_steps: number,
@@ -178,6 +180,8 @@ impl WgpuEngine {
             noise: s.noise,
             noise_seed: s.noise_seed,
             ssim_weight: s.ssim_weight,
+            ssim_share: if s.ssim_valid { view.valid_share } else { 1.0 },
+            ssim_margin: if s.ssim_valid { SSIM_REACH } else { 0 },
             weights: s.weights,
             mask_sum: view.mask_sum,
             confidence_sum: view.confidence_sum,
@@ -197,6 +201,7 @@ impl WgpuEngine {
             max_instances: self.frame.room.n_instances as u32,
             sh_degree: u32::from(sh_degree.min(self.memory.sh_degree)),
             sh_stored: u32::from(self.memory.sh_degree),
+            near: self.near,
             ..Step::default()
         }
     }

@@ -39,6 +39,9 @@ pub struct Step {
     pub noise: f32,
     pub noise_seed: u32,
     pub ssim_weight: f32,
+    pub ssim_share: f32,
+    pub ssim_margin: u32,
+    pub near: f32,
     pub weights: LossWeights,
     pub mask_sum: f32,
     pub confidence_sum: f32,
@@ -58,6 +61,7 @@ pub const FLAG_POSE_DIRECT: u32 = 4;
 pub const FLAG_POSE_SHARED: u32 = 8;
 pub const FLAG_DEPTH: u32 = 16;
 pub const FLAG_POSE_NETWORK: u32 = 32;
+pub const FLAG_ALL_SPLATS: u32 = 64;
 
 /// `Camera` of `shaders/lib/camera.wgsl`. Many fields: names of that struct.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
@@ -116,7 +120,7 @@ pub struct Moves {
     pub sh_stored: u32,
     pub min_opacity: f32,
     pub by_image: u32,
-    pub padding_0: u32,
+    pub keeps_age: u32,
     pub padding_1: u32,
 }
 

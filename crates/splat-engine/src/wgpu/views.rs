@@ -5,8 +5,8 @@ use std::sync::Arc;
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::pose_network::{Embedding, PoseNetwork, WIDTH, first_embedding};
-use crate::settings::PoseNetworkSettings;
-use crate::view::{Correspondence, TrainingView};
+use crate::settings::{FirstEmbedding, PoseNetworkSettings};
+use crate::view::{Correspondence, SSIM_REACH, TrainingView};
 use crate::wgpu::types::{
     LOG_FOCAL, NET_FLOATS, NET_SIZE, VIEW_EMBEDDING, VIEW_EMBEDDING_AGE, VIEW_EXPOSURE,
     VIEW_PINHOLE, VIEW_POSE_AGE, VIEW_POSE_M, VIEW_QUAT, VIEW_STRIDE, VIEW_TRANSLATION,
@@ -43,6 +43,8 @@ pub(crate) struct View {
     /// Photo with pixel weights, then depth with confidence.
     pub(crate) wanted: Buffer,
     pub(crate) mask_sum: f32,
+    /// Weight of all pixels over that of those whose whole SSIM window lies in the image; 0 where there are none.
+    pub(crate) valid_share: f32,
     pub(crate) confidence_sum: f32,
     pub(crate) matches: Vec<Correspondence>,
 }
@@ -72,7 +74,10 @@ impl Views {
         let ix = self.all.len();
         let pose = view.training.cam_from_world;
         let embedding = ix * VIEW_STRIDE + VIEW_EMBEDDING;
-        gpu.write(&self.records, embedding, &first_embedding(ix));
+        let kind = self
+            .pose_network
+            .map_or(FirstEmbedding::default(), |network| network.embedding);
+        gpu.write(&self.records, embedding, &first_embedding(kind, ix));
         self.write_camera(gpu, ix, &view.training.intrinsics);
         self.all.push(view);
         self.set_pose(gpu, ix, pose)?;
@@ -166,7 +171,7 @@ impl Views {
             self.write_base(gpu, ix, pose);
             let record = ix * VIEW_STRIDE;
             let mut row = [0.0_f32; 3 * WIDTH];
-            row[..WIDTH].copy_from_slice(&first_embedding(ix));
+            row[..WIDTH].copy_from_slice(&first_embedding(settings.embedding, ix));
             gpu.write(&self.records, record + VIEW_EMBEDDING, &row);
             gpu.write(&self.records, record + VIEW_EMBEDDING_AGE, &[0.0_f32]);
         }
@@ -215,6 +220,7 @@ impl View {
         Ok(Self {
             wanted: gpu.storage_of("wanted", &words)?,
             mask_sum: mask_sum(&training),
+            valid_share: valid_share(&training),
             confidence_sum: confidence_sum(&training),
             matches: Vec::new(),
             training,
@@ -232,6 +238,7 @@ impl View {
         }
         self.training = training;
         self.mask_sum = mask_sum(&self.training);
+        self.valid_share = valid_share(&self.training);
         self.confidence_sum = confidence_sum(&self.training);
         Ok(())
     }
@@ -277,11 +284,35 @@ fn wanted(view: &TrainingView) -> Vec<u32> {
     if let Some(depth) = view.depth.as_deref().filter(|depth| is_whole(depth)) {
         let n = depth.width_px as usize * depth.height_px as usize;
         words.extend((0..n).flat_map(|at| {
-            let (depth, confidence) = depth.verified(at).unwrap_or_default();
-            [depth, confidence].map(f32::to_bits)
+            let (given, verified) = (depth.depth[at], depth.verified(at));
+            let is_depth = given > 0.0 && given.is_finite();
+            let known = verified.unwrap_or((if is_depth { given } else { 0.0 }, 0.0));
+            [known.0, known.1].map(f32::to_bits)
         }));
     }
     words
+}
+
+fn valid_share(view: &TrainingView) -> f32 {
+    let (width, height) = (view.image.width_px, view.image.height_px);
+    let inside = |at: u32, side: u32| at >= SSIM_REACH && at + SSIM_REACH < side;
+    let valid: f64 = match &view.mask {
+        None => {
+            let [w, h] = [width, height].map(|side| side.saturating_sub(2 * SSIM_REACH));
+            f64::from(w) * f64::from(h)
+        }
+        Some(mask) => {
+            let pixels = mask.iter().zip(0_u32..);
+            let valid =
+                pixels.filter(|(_, p)| inside(p % width, width) && inside(p / width, height));
+            valid.map(|(byte, _)| f64::from(*byte)).sum::<f64>() / 255.0
+        }
+    };
+    if valid > 0.0 {
+        (f64::from(mask_sum(view)) / valid) as f32
+    } else {
+        0.0
+    }
 }
 
 fn mask_sum(view: &TrainingView) -> f32 {

@@ -98,9 +98,14 @@ fn emphases() -> Vec<(String, StepSettings)> {
         depth_mode,
         ..plain.clone()
     };
+    let valid = StepSettings {
+        ssim_valid: true,
+        ..ssim.clone()
+    };
     let mut emphases = vec![
         ("l1".to_owned(), plain.clone()),
         ("ssim".to_owned(), ssim),
+        ("ssim of whole windows".to_owned(), valid),
         (
             "depth as in the paper's code".to_owned(),
             depth(DepthMode::PaperCode),

@@ -11,10 +11,16 @@ const NONE: Weights = Weights {
     l1: 0.0,
     ssim: 0.0,
     depth_mode: DepthMode::InverseDepth,
+    ssim_valid: false,
+    all_splats: false,
     terms: LossWeights::all(0.0),
 };
 const L1: Weights = Weights { l1: 1.0, ..NONE };
 const SSIM: Weights = Weights { ssim: 1.0, ..NONE };
+const VALID_SSIM: Weights = Weights {
+    ssim_valid: true,
+    ..SSIM
+};
 const DEPTH: Weights = Weights {
     terms: LossWeights {
         depth_weight: 1.0,
@@ -60,7 +66,12 @@ fn eventful_scene(seed: u64, sh_degree: u8) -> Scene {
 }
 
 fn check_terms(sh_degree: u8, seed: u64) {
-    let photometric = [("l1", L1), ("ssim", SSIM), ("all", ALL)];
+    let photometric = [
+        ("l1", L1),
+        ("ssim", SSIM),
+        ("whole windows", VALID_SSIM),
+        ("all", ALL),
+    ];
     let stretched = [
         ("depth as in the paper's code", PAPER_CODE),
         ("depth as in the paper's text", PAPER_ALPHA),

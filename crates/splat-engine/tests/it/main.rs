@@ -14,6 +14,7 @@ mod gradients;
 mod hostile_splats;
 mod lost_gpu;
 mod mcmc;
+mod paper_steps;
 mod pose_network;
 mod reference;
 mod relocation;

@@ -7,7 +7,7 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::reference::pose_network::{Network, output_gradient};
 use splat_engine::pose_network::{Embedding, Moments, N_PARAMETERS, PoseNetwork, W3, WIDTH};
-use splat_engine::settings::PoseNetworkSettings;
+use splat_engine::settings::{FirstEmbedding, PoseNetworkSettings};
 use splat_types::transform::Rigid;
 
 /// Central differences in f64 with step 1e-5 lose some ten digits of a smooth function.
@@ -18,6 +18,7 @@ const STEP: f64 = 1e-5;
 fn random_network(seed: u64) -> (PoseNetwork, Embedding) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let settings = PoseNetworkSettings {
+        embedding: FirstEmbedding::Order,
         seed,
         camera_scale: 0.7,
     };
@@ -202,6 +203,7 @@ fn forward_and_backward_agree_with_the_reference() {
 #[test]
 fn a_fresh_network_moves_nothing_and_its_first_step_moves_all_alike() {
     let mut pose_network = PoseNetwork::new(&PoseNetworkSettings {
+        embedding: FirstEmbedding::Order,
         seed: 1,
         camera_scale: 2.0,
     });

@@ -14,6 +14,7 @@ pub const MOVES: McmcSettings = McmcSettings {
     max_splats: 1_000_000,
     growth: 1.0,
     active_steps: 0,
+    keeps_age: false,
     seed: 7,
 };
 /// An opacity of 0.0003: below what is drawn.

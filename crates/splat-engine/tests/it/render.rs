@@ -1,6 +1,6 @@
 //! Every backend's images against the reference's.
 
-use crate::backends::{BACKENDS, Backend};
+use crate::backends::{BACKENDS, Backend, ORDINARY};
 use crate::reference::hostile::{KINDS, camera};
 use crate::reference::random::{self, Recipe, SMALL, Scene};
 use crate::reference::raster::Raster;
@@ -273,5 +273,28 @@ fn a_image_that_is_off_by_three_thousandths_in_one_pixel_is_refused() {
             _ => wrong.depth[brightest] *= 1.003,
         }
         assert!(compare(&scene, &wrong, MAX_ERROR).is_err(), "{which}");
+    }
+}
+
+#[test]
+fn splats_before_the_near_plane_are_not_drawn() {
+    for backend in BACKENDS {
+        let scene = random::scene(6, &ORDINARY);
+        let to_cam = scene.view.cam_from_world;
+        let near = 1.7;
+        let is_behind = |mean: &[f32; 3]| {
+            let mean = glam::DVec3::from(mean.map(f64::from));
+            to_cam.transform_point(mean).z > f64::from(near)
+        };
+        let keep: Vec<bool> = scene.splats.means.iter().map(is_behind).collect();
+        let n_kept = keep.iter().filter(|keeps| **keeps).count();
+        assert!(0 < n_kept && n_kept < keep.len());
+        let mut engine = (backend.engine)();
+        engine.set_near(near);
+        let found = Backend::render(&mut *engine, &scene);
+        engine.set_near(0.0);
+        engine.retain(&keep).unwrap();
+        let wanted = engine.render(&scene.view.intrinsics, &to_cam, 3).unwrap();
+        assert_eq!(found, wanted, "{}", backend.name);
     }
 }

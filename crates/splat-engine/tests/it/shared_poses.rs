@@ -9,7 +9,7 @@ use crate::backends::{BACKENDS, ORDINARY};
 use crate::reference::random::{self, rng};
 use splat_engine::loss_weights::LossWeights;
 use splat_engine::pose_network::{Embedding, Moments, PoseNetwork, first_embedding};
-use splat_engine::settings::{PoseMode, PoseNetworkSettings, StepSettings};
+use splat_engine::settings::{FirstEmbedding, PoseMode, PoseNetworkSettings, StepSettings};
 use splat_engine::traits::Engine;
 use splat_engine::view::TrainingView;
 use splat_types::camera::Intrinsics;
@@ -21,6 +21,7 @@ use splat_types::transform::{Rigid, Similarity};
 const POSE_ERROR: f64 = 1e-5;
 
 pub const NETWORK: PoseNetworkSettings = PoseNetworkSettings {
+    embedding: FirstEmbedding::Order,
     seed: 4,
     camera_scale: 0.8,
 };
@@ -71,8 +72,12 @@ fn shared_steps_move_all_views_as_the_network_says() {
 
         engine.start_pose_network(&NETWORK).unwrap();
         let mut network = PoseNetwork::new(&NETWORK);
-        let mut rows: [(Embedding, Moments); 2] =
-            std::array::from_fn(|ix| (first_embedding(ix), Moments::default()));
+        let mut rows: [(Embedding, Moments); 2] = std::array::from_fn(|ix| {
+            (
+                first_embedding(FirstEmbedding::Order, ix),
+                Moments::default(),
+            )
+        });
         for n in 0..6 {
             let view_ix = n % 2;
             let seen = TrainingView {
@@ -324,6 +329,7 @@ fn left_over(
     engine.replace(&splats).unwrap();
     engine
         .start_pose_network(&PoseNetworkSettings {
+            embedding: FirstEmbedding::Order,
             seed: 1,
             camera_scale: 0.4,
         })

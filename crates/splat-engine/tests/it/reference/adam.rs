@@ -41,6 +41,25 @@ impl SplatAdam {
         }
     }
 
+    /// Moments of one splat to 0; its count of updates stays.
+    pub fn clear(&mut self, ix: usize) {
+        for moments in [&mut self.m, &mut self.v] {
+            let stride = moments.sh_stride();
+            moments.means[ix] = [0.0; 3];
+            moments.log_scales[ix] = [0.0; 3];
+            moments.quats[ix] = [0.0; 4];
+            moments.opacity_logits[ix] = 0.0;
+            moments.sh[ix * stride..(ix + 1) * stride].fill(0.0);
+        }
+    }
+
+    /// Room for one more splat.
+    pub fn push(&mut self) {
+        self.m.push_zeros();
+        self.v.push_zeros();
+        self.n_updates.push(0);
+    }
+
     /// Splats that were not seen keep value, moments and age; so do coefficients above the active degree.
     pub fn update(
         &mut self,

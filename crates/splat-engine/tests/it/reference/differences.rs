@@ -15,8 +15,9 @@ const STEP: f64 = 1e-5;
 const MAX_RELATIVE: f64 = 1e-5;
 /// Numbers far below the largest of their array are held against this share of it.
 const FLOOR: f64 = 1e-3;
-/// Share of parameters whose difference may span a jump and is then no derivative.
-const MAX_SKIPPED: f64 = 0.03;
+/// Share of parameters whose difference may span a jump and is then no derivative. Depth that is stretched over all pixels jumps
+/// wherever the edge of a splat takes in a pixel.
+const MAX_SKIPPED: f64 = 0.1;
 
 pub const ARRAYS: [&str; 8] = [
     "means",
@@ -133,8 +134,8 @@ impl Problem {
                 .fold(0.0, |max: f64, n| max.max(n.abs()));
             for (k, (claim, numeric)) in claimed.iter().zip(&numeric).enumerate() {
                 let Some(numeric) = numeric else { continue };
-                // Rounding of the loss alone moves a vanishing array by so much.
-                let error = (claim - numeric).abs() / numeric.abs().max(FLOOR * largest).max(1e-7);
+                // Rounding of a loss near 1 moves a difference by some 1e-11.
+                let error = (claim - numeric).abs() / numeric.abs().max(FLOOR * largest).max(5e-6);
                 if error.is_nan() || error > MAX_RELATIVE {
                     return Err(format!(
                         "{array}[{k}]: claimed {claim:e}, differences say {numeric:e}"

@@ -41,7 +41,7 @@ pub fn loss(raster: &Raster, target: &Target, weights: &Weights) -> Loss {
             0.0
         } else {
             let size = [raster.width_px, raster.height_px];
-            ssim_sum(&exposed, size, target, -weights.ssim / norm, &mut v_rgb) / norm
+            mean_ssim(&exposed, size, target, weights, &mut v_rgb)
         };
     }
     let mut v_exposure = [[0.0; 3]; 2];
@@ -77,6 +77,30 @@ fn mean_difference(rendered: &[f64], target: &Target, scale: f64, v_rgb: &mut [f
         v_rgb[at] += scale * weight * if r == g { 0.0 } else { (r - g).signum() };
     }
     sum
+}
+
+/// Over all pixels, or those whose whole window lies in the image; adds the gradient of the loss's term.
+fn mean_ssim(
+    rendered: &[f64],
+    size: [usize; 2],
+    target: &Target,
+    weights: &Weights,
+    v_rgb: &mut [f64],
+) -> f64 {
+    let mut averaged = target.clone();
+    if weights.ssim_valid {
+        let reach = WINDOW_RADIUS as usize;
+        for (pixel, weight) in averaged.weights.iter_mut().enumerate() {
+            let (x, y) = (pixel % size[0], pixel / size[0]);
+            let is_whole = |at: usize, side: usize| at >= reach && at + reach < side;
+            *weight *= f64::from(u8::from(is_whole(x, size[0]) && is_whole(y, size[1])));
+        }
+    }
+    let norm = 3.0 * averaged.weights.iter().sum::<f64>();
+    if norm == 0.0 {
+        return 1.0;
+    }
+    ssim_sum(rendered, size, &averaged, -weights.ssim / norm, v_rgb) / norm
 }
 
 /// Weighted sum of SSIM over pixels and channels; adds `scale` times its gradient (Wang 2004, window as in 3DGS).

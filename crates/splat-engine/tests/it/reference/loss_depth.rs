@@ -80,7 +80,7 @@ fn huber(error: f64) -> (f64, f64, i8) {
     }
 }
 
-/// Mean of |minmax(rendered) - minmax(wanted)|: alpha and depth, or depth and 1 - minmax(1 / depth).
+/// Mean over all pixels with a depth of |minmax(rendered) - minmax(wanted)|: alpha and depth, or depth and 1 - minmax(1 / depth).
 fn stretched(
     raster: &Raster,
     target: &Target,
@@ -94,15 +94,17 @@ fn stretched(
         margin: f64::INFINITY,
     };
     let pixels: Vec<usize> = (0..raster.alpha.len())
-        .filter(|&pixel| target.depth[pixel].1 > 0.0 && raster.alpha[pixel] > MIN_DEPTH_ALPHA)
+        .filter(|&pixel| target.depth[pixel].0 > 0.0)
         .collect();
     let rendered: Vec<f64> = pixels
         .iter()
         .map(|&pixel| {
             if is_alpha {
                 raster.alpha[pixel]
-            } else {
+            } else if raster.alpha[pixel] > 0.0 {
                 raster.depth_sum[pixel] / raster.alpha[pixel]
+            } else {
+                0.0
             }
         })
         .collect();
@@ -140,7 +142,11 @@ fn stretched(
         };
         decisions.branches[pixels[i]] = Some(sign as i8);
         let is_end = i == low || i == high;
-        if !is_end {
+        // Where there is no splat the numbers are 0 in every implementation.
+        let is_certain = raster.alpha[pixels[i]] == 0.0;
+        if is_certain {
+            // Nothing to decide.
+        } else if !is_end {
             let to_ends = (rendered[i] - rendered[low]).min(rendered[high] - rendered[i]) / range;
             decisions.margin = decisions.margin.min(difference.abs()).min(to_ends);
         } else if difference != 0.0 {
@@ -155,7 +161,7 @@ fn stretched(
     for (i, &pixel) in pixels.iter().enumerate() {
         if is_alpha {
             v_alpha[pixel] += v[i];
-        } else {
+        } else if raster.alpha[pixel] > 0.0 {
             v_depth_sum[pixel] += v[i] / raster.alpha[pixel];
             v_alpha[pixel] -= v[i] * rendered[i] / raster.alpha[pixel];
         }

@@ -8,6 +8,7 @@ pub mod doubt;
 pub mod hostile;
 pub mod loss;
 pub mod loss_depth;
+pub mod paper_run;
 pub mod pose_network;
 pub mod project;
 pub mod project_backward;
@@ -54,7 +55,7 @@ pub struct Camera {
 pub struct Target {
     /// 0 to 1, r g b per pixel.
     pub rgb: Vec<f64>,
-    /// (depth, confidence) per image pixel; (0, 0) where there is none.
+    /// (depth, confidence) per image pixel; 0 where there is no depth, or the pixel does not count, and where nothing verified it.
     pub depth: Vec<(f64, f64)>,
     /// How much each pixel counts, 0 to 1.
     pub weights: Vec<f64>,
@@ -68,6 +69,10 @@ pub struct Weights {
     pub l1: f64,
     pub ssim: f64,
     pub depth_mode: DepthMode,
+    /// SSIM over the pixels whose whole window lies in the image.
+    pub ssim_valid: bool,
+    /// Regularisers are means over all splats, seen or not.
+    pub all_splats: bool,
     /// Of the terms beside the photometric loss.
     pub terms: LossWeights,
 }
@@ -98,6 +103,15 @@ impl Params {
             sh: vec![0.0; other.sh.len()],
             sh_degree: other.sh_degree,
         }
+    }
+
+    /// One more splat, of zeros.
+    pub fn push_zeros(&mut self) {
+        self.means.push([0.0; 3]);
+        self.log_scales.push([0.0; 3]);
+        self.quats.push([0.0; 4]);
+        self.opacity_logits.push(0.0);
+        self.sh.extend(vec![0.0; self.sh_stride()]);
     }
 
     pub fn sh_stride(&self) -> usize {
@@ -155,6 +169,8 @@ impl Target {
                     pixel / width_px,
                     [width_px, height_px],
                 );
+                let counts = weights[pixel] > 0.0;
+                let depth = if counts { depth } else { 0.0 };
                 (depth, weights[pixel] * confidence)
             })
             .collect();
@@ -178,10 +194,12 @@ fn sample_depth(map: Option<&Arc<DepthMap>>, x: usize, y: usize, size: [usize; 2
         + nearest(x, size[0], map.width_px);
     let (depth, confidence) = (f64::from(map.depth[ix]), f64::from(map.confidence[ix]));
     // NaN fails both comparisons.
-    if depth > 0.0 && depth.is_finite() && confidence > 0.0 {
+    if !(depth > 0.0 && depth.is_finite()) {
+        (0.0, 0.0)
+    } else if confidence > 0.0 {
         (depth, confidence)
     } else {
-        (0.0, 0.0)
+        (depth, 0.0)
     }
 }
 
@@ -192,6 +210,8 @@ impl Weights {
             l1: 1.0 - ssim,
             ssim,
             depth_mode: settings.depth_mode,
+            ssim_valid: settings.ssim_valid,
+            all_splats: settings.all_splats,
             terms: settings.weights,
         }
     }
@@ -228,7 +248,9 @@ pub fn gradients(
     let on_projected = raster_backward::raster_backward(&projected, &raster, &loss);
     let (mut splats, pose, log_focal) =
         project_backward::project_backward(params, camera, &projected, &on_projected, sh_degree);
-    loss.total += loss::regularise(params, &visible, weights, &mut splats);
+    let all: Vec<usize> = (0..params.means.len()).collect();
+    let regularised = if weights.all_splats { &all } else { &visible };
+    loss.total += loss::regularise(params, regularised, weights, &mut splats);
     Gradients {
         splats,
         pose,

@@ -12,7 +12,7 @@ use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
 use crate::mapper::splats::transform::transform_all;
 use splat_engine::error::EngineError;
-use splat_engine::settings::PoseNetworkSettings;
+use splat_engine::settings::{FirstEmbedding, PoseNetworkSettings};
 use splat_engine::traits::Engine;
 use splat_geometry::similarity;
 use splat_types::transform::{Rigid, Similarity};
@@ -76,6 +76,7 @@ impl PoseAnchor {
         let is_due = spread > RESTART_GROWTH * old;
         if let Some(seed) = network_seed.filter(|_| is_due) {
             engine.start_pose_network(&PoseNetworkSettings {
+                embedding: FirstEmbedding::Order,
                 seed,
                 camera_scale: spread as f32,
             })?;

@@ -141,6 +141,7 @@ pub(crate) fn relocate(
         max_splats: map.splats.cap(map.params, map.keyframes, map.engine),
         growth: map.params.mcmc.growth,
         active_steps: active_steps as u32,
+        keeps_age: false,
         seed: seed as u32,
     };
     map.engine.relocate_and_grow(&settings)?;
