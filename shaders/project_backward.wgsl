@@ -14,7 +14,8 @@
 @group(0) @binding(2) var<storage, read> projected: array<Projected>;
 @group(0) @binding(3) var<storage, read> splat_sums: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> geometry: array<vec4<f32>>;
-// First and second moments of each vec4 of `geometry`; in w of the log-scale's first, all updates of the splat.
+// First and second moments of each vec4 of `geometry`; in w of the log-scale's first, all updates of the splat, of the base
+// colour's, sum and number of its screen gradients.
 @group(0) @binding(5) var<storage, read_write> moments: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> sh_rest: array<f32>;
 // Per splat: first moments as bf16 pairs, then one second moment per band.
@@ -38,6 +39,8 @@ struct Gradient {
     rho: vec3<f32>,
     log_focal: f32,
     theta: vec3<f32>,
+    // Norm by the projected mean, in normalised device coordinates.
+    screen: f32,
 }
 
 fn outer(a: vec3<f32>, b: vec3<f32>) -> mat3x3<f32> {
@@ -92,6 +95,7 @@ fn gradient_of(visible_ix: u32, splat: Projected, shape: Shape, mean: vec3<f32>)
     let by_direction = direction_gradient(splat.splat_ix, to_splat / distance, distance, g.color);
 
     let g_center = vec2<f32>(conic.x * sum0.y + conic.y * sum0.z, conic.y * sum0.y + conic.z * sum0.z);
+    g.screen = length(0.5 * vec2<f32>(f32(step.width_px), f32(step.height_px)) * g_center);
     // By the conic as a symmetric matrix, then by the covariance: -Q GQ Q.
     let gq = vec3<f32>(0.5 * sum1.x, 0.5 * sum1.y, 0.5 * sum1.z);
     let r0 = vec2<f32>(gq.x * conic.x + gq.y * conic.y, gq.x * conic.y + gq.y * conic.z);
@@ -229,8 +233,13 @@ fn update_splat(splat_ix: u32, direction: vec3<f32>, g: Gradient) {
     var mean = updated(geometry[at], vec4<f32>(g.mean, g.opacity_logit), m, position_rates, correction);
     let quat = updated(geometry[at + 1u], g.quat, m + 2u, vec4<f32>(step.lr_quat), correction);
     let log_scale = updated(vec4<f32>(scale.xyz, 0.0), vec4<f32>(g.log_scale, 0.0), m + 4u, vec4<f32>(step.lr_scale), correction).xyz;
+    let screen = vec2<f32>(moments[m + 6u].w, moments[m + 7u].w);
     let color = updated(vec4<f32>(base.xyz, 0.0), vec4<f32>(g.base, 0.0), m + 6u, vec4<f32>(step.lr_sh0), correction).xyz;
     moments[m + 4u].w = in_all;
+    let is_counted = (step.flags & FLAG_SCREEN_GRADIENTS) != 0u && is_finite(g.screen);
+    let more = select(vec2<f32>(0.0), vec2<f32>(g.screen, 1.0), is_counted);
+    moments[m + 6u].w = screen.x + more.x;
+    moments[m + 7u].w = screen.y + more.y;
     if step.noise > 0.0 {
         let moved = shaken(splat_ix, mean.xyz, mean.w, quat, log_scale);
         if is_finite3(moved) {

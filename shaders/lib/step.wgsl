@@ -57,6 +57,7 @@ const FLAG_POSE_DIRECT: u32 = 4u;
 const FLAG_POSE_SHARED: u32 = 8u;
 const FLAG_DEPTH: u32 = 16u;
 const FLAG_POSE_NETWORK: u32 = 32u;
+const FLAG_SCREEN_GRADIENTS: u32 = 64u;
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

@@ -115,6 +115,11 @@ impl CpuEngine {
             n_skipped += self
                 .optimiser
                 .update(splats, seen, g, settings, self.n_trained);
+            if settings.accumulate_screen_gradients {
+                let size_px = [view.image.width_px, view.image.height_px];
+                let sums = &mut self.optimiser.screen_gradients;
+                sums.add(splats.len(), seen, g, size_px);
+            }
             crate::cpu::mcmc::add_noise(splats, seen, settings, self.n_trained);
         }
         self.count_troubles(n_skipped);

@@ -5,8 +5,8 @@ use crate::settings::{DepthMode, PoseMode, StepSettings};
 use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::passes;
 use crate::wgpu::types::{
-    Camera, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED, FLAG_TRAIN_SPLATS,
-    Step, TILE_PX,
+    Camera, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED,
+    FLAG_SCREEN_GRADIENTS, FLAG_TRAIN_SPLATS, Step, TILE_PX,
 };
 use splat_gpu::commands::Commands;
 use splat_gpu::error::GpuError;
@@ -150,6 +150,7 @@ impl WgpuEngine {
             | flag(s.moves_alone(), FLAG_POSE_DIRECT)
             | flag(s.pose == PoseMode::Shared, FLAG_POSE_SHARED)
             | flag(has_depth, FLAG_DEPTH)
+            | flag(s.accumulate_screen_gradients, FLAG_SCREEN_GRADIENTS)
             | flag(self.views.pose_network.is_some(), FLAG_POSE_NETWORK);
         Step {
             view_ix: view_ix as u32,
