@@ -58,6 +58,7 @@ mod replay;
 mod report;
 mod resume;
 mod scene_formats;
+mod scene_points;
 mod scene_reference;
 mod scenes;
 mod sent_corrections;
