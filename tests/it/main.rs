@@ -46,6 +46,7 @@ mod onnx_models;
 mod onnx_node;
 mod over_zenoh;
 mod photometric;
+mod point_start;
 mod pose_anchor;
 mod provisional_splats;
 

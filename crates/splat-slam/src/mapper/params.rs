@@ -1,4 +1,4 @@
-//! Parameters of mapping: `map.*`, `train.*`, `mcmc.*`.
+//! Parameters of mapping: `map.*`, `train.*`, `mcmc.*`, `densify.*`.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,6 +11,7 @@ pub struct MapperParams {
     pub map: MapParams,
     pub train: TrainParams,
     pub mcmc: McmcParams,
+    pub densify: DensifyParams,
 }
 
 /// Parameters `map.*`: budgets of memory and disk, files, snapshots.
@@ -81,6 +82,13 @@ pub struct TrainParams {
     /// Share of the steps that are made after the last keyframe.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub final_share: f64,
+    /// What the first splats are made from: depth = the depth of each keyframe; points = the scene's sparse points (points3D of a
+    /// COLMAP model, ply_file_path of a transforms.json), with geometry ground_truth, and no splat from depth.
+    pub start: Start,
+    /// Scale of a splat that starts from a point, as a multiple of the distance to its three nearest neighbours; 1 in 3DGS,
+    /// 0.1 in 3DGS-MCMC.
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub start_scale: f32,
     /// Splats that a keyframe may add where the map has none yet.
     #[schemars(range(min = 1, max = 1000000))]
     pub seeds_per_keyframe: usize,
@@ -156,6 +164,8 @@ impl Default for TrainParams {
             steps: 3000,
             max_side: 480,
             final_share: 0.5,
+            start: Start::Depth,
+            start_scale: 1.0,
             seeds_per_keyframe: 5000,
             sh_degree: 3,
             ssim_weight: 0.2,
@@ -231,6 +241,66 @@ impl Default for McmcParams {
             min_opacity: 0.02,
         }
     }
+}
+
+/// Parameters `densify.*`: growth by a threshold on gradients (3D Gaussian Splatting).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct DensifyParams {
+    /// Splats with large screen gradients are cloned or split, faint and too large ones removed, opacities reset (3DGS);
+    /// without mcmc.enabled.
+    pub enabled: bool,
+    /// Step after which the first splats are cloned and split.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub start: u64,
+    /// Step from which on none are, nor opacities reset; at 60 % of the steps after the last keyframe at the latest.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub until: u64,
+    /// Steps between passes.
+    #[schemars(range(min = 1, max = 1000000))]
+    pub every: u64,
+    /// Mean norm of the loss's gradient by the projected mean, in normalised device coordinates, from which on a splat is
+    /// cloned or split.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub gradient: f32,
+    /// Splats up to this largest scale are cloned, larger ones split; share of the radius of the cameras.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub dense_share: f32,
+    /// Splats above this largest scale are removed once opacities were reset; share of the radius of the cameras; 0 = none.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub max_share: f32,
+    /// Steps between resets of all opacities to twice min_opacity at most; 0 = none.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub opacity_reset_every: u64,
+    /// Splats below it are removed in each pass.
+    #[schemars(range(min = 0.0, max = 0.25))]
+    pub min_opacity: f32,
+}
+
+impl Default for DensifyParams {
+    fn default() -> Self {
+        Self {
+            enabled: false,
+            start: 500,
+            until: 15_000,
+            every: 100,
+            gradient: 0.0002,
+            dense_share: 0.01,
+            max_share: 0.1,
+            opacity_reset_every: 3000,
+            min_opacity: 0.005,
+        }
+    }
+}
+
+/// What the first splats are made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// The depth of each keyframe.
+    Depth,
+    /// The sparse points of the scene.
+    Points,
 }
 
 /// How keyframe poses are optimised with the splats.
