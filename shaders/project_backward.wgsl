@@ -12,7 +12,8 @@
 @group(0) @binding(2) var<storage, read> projected: array<Projected>;
 @group(0) @binding(3) var<storage, read> splat_sums: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> geometry: array<vec4<f32>>;
-// First and second moments of each vec4 of `geometry`; in w of the log-scale's first, all updates of the splat.
+// First and second moments of each vec4 of `geometry`; in w of the log-scale's first, all updates of the splat, of the base
+// colour's, sum and number of its screen gradients.
 @group(0) @binding(5) var<storage, read_write> moments: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> sh_rest: array<f32>;
 // Per splat: first moments as bf16 pairs, then one second moment per band.
@@ -74,6 +75,7 @@ fn gradient_of(visible_ix: u32, splat: Projected, shape: Shape, mean: vec3<f32>)
     let by_direction = direction_gradient(splat.splat_ix, to_splat / distance, distance, g.color);
 
     let g_center = vec2<f32>(conic.x * sum0.y + conic.y * sum0.z, conic.y * sum0.y + conic.z * sum0.z);
+    g.screen = length(0.5 * vec2<f32>(f32(step.width_px), f32(step.height_px)) * g_center);
     // By the conic as a symmetric matrix, then by the covariance: -Q GQ Q.
     let gq = vec3<f32>(0.5 * sum1.x, 0.5 * sum1.y, 0.5 * sum1.z);
     let r0 = vec2<f32>(gq.x * conic.x + gq.y * conic.y, gq.x * conic.y + gq.y * conic.z);

@@ -28,6 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let scale = exp(geometry[at + 2u].xyz);
     let per_splat = 1.0 / f32(step.n_splats);
     var g: Gradient;
+    g.screen = -1.0;
     g.opacity_logit = step.opacity_reg * per_splat * opacity * (1.0 - opacity);
     g.log_scale = scale * step.scale_reg * per_splat / 3.0;
     if is_finite(g.opacity_logit) && is_finite3(g.log_scale) {

@@ -51,7 +51,7 @@ enum Command {
 /// Parameters, as launch/params.yaml lists them.
 #[derive(Debug, Args)]
 struct ParamArgs {
-    /// Values for a purpose, launch/presets/NAME.yaml: paper; --params and --set go over them
+    /// Values for a purpose, launch/presets/NAME.yaml: paper, 3dgs; --params and --set go over them
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
     /// File in ROS 2 parameter form; any subset of launch/params.yaml

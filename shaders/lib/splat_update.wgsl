@@ -21,6 +21,8 @@ struct Gradient {
     rho: vec3<f32>,
     log_focal: f32,
     theta: vec3<f32>,
+    // Norm by the projected mean, in normalised device coordinates; below 0: not seen.
+    screen: f32,
 }
 
 fn updated(value: vec4<f32>, g: vec4<f32>, at: u32, rate: vec4<f32>, correction: vec2<f32>) -> vec4<f32> {
@@ -111,8 +113,13 @@ fn update_splat(splat_ix: u32, direction: vec3<f32>, g: Gradient) {
     var mean = updated(geometry[at], vec4<f32>(g.mean, g.opacity_logit), m, position_rates, correction);
     let quat = updated(geometry[at + 1u], g.quat, m + 2u, vec4<f32>(step.lr_quat), correction);
     let log_scale = updated(vec4<f32>(scale.xyz, 0.0), vec4<f32>(g.log_scale, 0.0), m + 4u, vec4<f32>(step.lr_scale), correction).xyz;
+    let screen = vec2<f32>(moments[m + 6u].w, moments[m + 7u].w);
     let color = updated(vec4<f32>(base.xyz, 0.0), vec4<f32>(g.base, 0.0), m + 6u, vec4<f32>(step.lr_sh0), correction).xyz;
     moments[m + 4u].w = in_all;
+    let is_counted = (step.flags & FLAG_SCREEN_GRADIENTS) != 0u && g.screen >= 0.0 && is_finite(g.screen);
+    let more = select(vec2<f32>(0.0), vec2<f32>(g.screen, 1.0), is_counted);
+    moments[m + 6u].w = screen.x + more.x;
+    moments[m + 7u].w = screen.y + more.y;
     if step.noise > 0.0 {
         let moved = shaken(splat_ix, mean.xyz, mean.w, quat, log_scale);
         if is_finite3(moved) {

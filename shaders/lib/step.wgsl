@@ -65,6 +65,8 @@ const FLAG_DEPTH: u32 = 16u;
 const FLAG_POSE_NETWORK: u32 = 32u;
 // Also splats that the view does not see are moved.
 const FLAG_ALL_SPLATS: u32 = 64u;
+// Gradients by the projected means are added up.
+const FLAG_SCREEN_GRADIENTS: u32 = 128u;
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::anyhow;
+use anyhow::{anyhow, bail};
 
 use crate::node::autosave::Autosave;
 use crate::node::job::Job;
@@ -14,7 +14,9 @@ use crate::node::track_thread::TrackStage;
 use splat_io::queue::{WhenFull, queue};
 use splat_slam::mapper::map_file::checkpoint;
 use splat_slam::mapper::mapper::Mapper;
+use splat_slam::mapper::params::Start;
 use splat_types::snapshot::Scale;
+use splat_types::sparse_point::SparsePoint;
 
 /// The map, who tracks by it, and the first id of keyframes that come.
 pub(crate) struct Opened {
@@ -31,6 +33,9 @@ pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
     let mut map = Mapper::new(params.mapper(), params.seed, scale, engine)
         .measuring_scale(&params.scale)
         .paging_to(Box::new(pages));
+    if params.train.start == Start::Points {
+        map = map.starting_from(start_points(job)?);
+    }
     let mut track = TrackStage::new(&params.track, job.is_live);
     track.grace = ShutdownTimeout::new(job.stop.clone());
     if !params.map.resume.is_empty() {
@@ -60,4 +65,23 @@ pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
         track,
         first_id,
     })
+}
+
+/// Points in the frame of the poses that the geometry answers with.
+fn start_points(job: &Job) -> anyhow::Result<Vec<SparsePoint>> {
+    let params = &job.params;
+    if params.geometry != "ground_truth" || params.ground_truth.windows {
+        bail!(
+            "train.start = points, and geometry {:?} has poses in a frame of its own, not in that of the scene's points: use --geometry ground_truth without ground_truth.windows, or train.start=depth",
+            params.geometry
+        );
+    }
+    let points = job.source.sparse_points()?;
+    if points.is_empty() {
+        bail!(
+            "train.start = points, and the source has no sparse points: name a COLMAP scene with points3D.bin or points3D.txt beside its cameras, or a transforms.json with ply_file_path, or use train.start=depth"
+        );
+    }
+    tracing::info!("{} points of the scene to start from", points.len());
+    Ok(points)
 }

@@ -28,6 +28,10 @@ pub enum ParamsError {
     )]
     Overlap { overlap: usize, size: usize },
     #[error(
+        "parameters densify.enabled and mcmc.enabled are both true, and both decide which splats come and go: set one of them to false"
+    )]
+    TwoGrowths,
+    #[error(
         "parameter {key} is read at the start only: set it in a parameter file, by --set or behind --ros-args, and start anew"
     )]
     Fixed { key: String },

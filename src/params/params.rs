@@ -15,7 +15,7 @@ use splat_io::params::{RecordParams, SourceParams};
 use splat_ros::params::PublishParams;
 use splat_ros::ros2::params::Ros2Params;
 use splat_slam::mapper::metric_scale_params::ScaleParams;
-use splat_slam::mapper::params::{MapParams, MapperParams, McmcParams, TrainParams};
+use splat_slam::mapper::params::{DensifyParams, MapParams, MapperParams, McmcParams, TrainParams};
 use splat_slam::select::params::SelectParams;
 use splat_slam::track::params::TrackParams;
 
@@ -64,6 +64,8 @@ pub struct Params {
     pub train: TrainParams,
     /// 3DGS-MCMC.
     pub mcmc: McmcParams,
+    /// Densification of 3DGS.
+    pub densify: DensifyParams,
     /// Metric scale.
     pub scale: ScaleParams,
     /// Evaluation.
@@ -96,6 +98,7 @@ impl Default for Params {
             map: MapParams::default(),
             train: TrainParams::default(),
             mcmc: McmcParams::default(),
+            densify: DensifyParams::default(),
             scale: ScaleParams::default(),
             eval: EvalParams::default(),
             publish: PublishParams::default(),
@@ -111,6 +114,7 @@ impl Params {
             map: self.map.clone(),
             train: self.train.clone(),
             mcmc: self.mcmc.clone(),
+            densify: self.densify.clone(),
         }
     }
 }

@@ -14,7 +14,10 @@ use crate::params::schema::{allows, descriptors};
 use splat_ros::ros2::parameter_store::Range;
 
 /// Named sets of values in `launch/presets`.
-const PRESETS: [(&str, &str); 1] = [("paper", include_str!("../../launch/presets/paper.yaml"))];
+const PRESETS: [(&str, &str); 2] = [
+    ("paper", include_str!("../../launch/presets/paper.yaml")),
+    ("3dgs", include_str!("../../launch/presets/3dgs.yaml")),
+];
 
 /// Values by dotted key; every parameter is there.
 #[derive(Debug, Clone)]
@@ -168,6 +171,9 @@ impl Settings {
                 overlap: select.batch_overlap,
                 size: select.batch_size,
             });
+        }
+        if params.densify.enabled && params.mcmc.enabled {
+            return Err(ParamsError::TwoGrowths);
         }
         Ok(params)
     }

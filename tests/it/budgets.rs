@@ -40,7 +40,7 @@ fn params() -> MapperParams {
             max_side: 64,
             ..TrainParams::default()
         },
-        mcmc: McmcParams::default(),
+        ..MapperParams::default()
     }
 }
 

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use splat_engine::cpu::engine::CpuEngine;
+use splat_engine::densify::ScreenGradients;
 use splat_engine::error::EngineError;
 use splat_engine::settings::{McmcSettings, Memory, PoseNetworkSettings, StepSettings, StepStats};
 use splat_engine::traits::{Device, Engine, Renderer, SplatBuffers, Trainer, ViewStore};
@@ -185,6 +186,14 @@ impl<E: Engine, H: Hooks<E>> Trainer for Hooked<H, E> {
     fn relocate_and_grow(&mut self, settings: &McmcSettings) -> Result<usize, EngineError> {
         self.hooks.before(&self.inner, "relocate_and_grow")?;
         self.inner.relocate_and_grow(settings)
+    }
+    fn take_screen_gradients(&mut self) -> Result<ScreenGradients, EngineError> {
+        self.hooks.before(&self.inner, "take_screen_gradients")?;
+        self.inner.take_screen_gradients()
+    }
+    fn reset_opacities(&mut self, max_opacity: f32) -> Result<(), EngineError> {
+        self.hooks.before(&self.inner, "reset_opacities")?;
+        self.inner.reset_opacities(max_opacity)
     }
     fn start_pose_network(&mut self, settings: &PoseNetworkSettings) -> Result<(), EngineError> {
         self.hooks.before(&self.inner, "start_pose_network")?;

@@ -34,7 +34,7 @@ fn cut_models_are_errors_that_name_the_file() {
         }
         std::fs::write(model.join(name), &whole).unwrap();
     }
-    // Points are found again in the images: whatever stands here is left alone.
+    // Views need no points: whatever stands here is left alone.
     std::fs::write(model.join("points3D.bin"), [0xff; 8]).unwrap();
     assert_eq!(error_of(root.path()), None);
 }

@@ -46,6 +46,7 @@ mod onnx_models;
 mod onnx_node;
 mod over_zenoh;
 mod photometric;
+mod point_start;
 mod pose_anchor;
 mod provisional_splats;
 
@@ -58,6 +59,7 @@ mod replay;
 mod report;
 mod resume;
 mod scene_formats;
+mod scene_points;
 mod scene_reference;
 mod scenes;
 mod sent_corrections;

@@ -14,9 +14,7 @@ use splat_engine::traits::{SplatBuffers as _, ViewStore as _};
 use splat_geometry::model::GeometryModel as _;
 use splat_mapper::params::settings::Settings;
 use splat_slam::mapper::mapper::Mapper;
-use splat_slam::mapper::params::{
-    MapParams, MapperParams, McmcParams, PoseOptimization, TrainParams,
-};
+use splat_slam::mapper::params::{MapParams, MapperParams, PoseOptimization, TrainParams};
 use splat_slam::mapper::splats::transform::Carry;
 use splat_slam::mapper::train::schedule::End;
 use splat_types::frame::Frame;
@@ -83,7 +81,7 @@ fn map_params(pose_opt: PoseOptimization) -> MapperParams {
             seeds_per_keyframe: 20,
             ..TrainParams::default()
         },
-        mcmc: McmcParams::default(),
+        ..MapperParams::default()
     }
 }
 

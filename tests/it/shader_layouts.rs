@@ -282,6 +282,7 @@ fn shared_numbers_are_those_of_the_host() {
         ("FLAG_POSE_SHARED", types::FLAG_POSE_SHARED),
         ("FLAG_DEPTH", types::FLAG_DEPTH),
         ("FLAG_POSE_NETWORK", types::FLAG_POSE_NETWORK),
+        ("FLAG_SCREEN_GRADIENTS", types::FLAG_SCREEN_GRADIENTS),
     ] {
         check("update_view", constant, u64::from(expected));
     }

@@ -106,6 +106,8 @@ pub mod gradients;
 
 pub mod mcmc;
 
+pub mod densify;
+
 pub mod loss_weights;
 
 pub mod settings;

@@ -119,6 +119,8 @@ pub struct StepSettings {
     pub sh_degree: u8,
     /// Band b of a splat is trained from its `b * sh_interval`-th update on; 0: at once.
     pub sh_interval: u32,
+    /// Each splat that the step sees and moves adds up its screen gradient, for densification.
+    pub accumulate_screen_gradients: bool,
     /// false: the splats are frozen and only the view's pose and exposure move (test-time refinement).
     pub train_splats: bool,
     /// How the view's pose may move.

@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use crate::densify::ScreenGradients;
 use crate::error::EngineError;
 use crate::settings::{McmcSettings, Memory, PoseNetworkSettings, StepSettings, StepStats};
 use crate::view::{Correspondence, TrainingView};
@@ -144,6 +145,12 @@ pub trait Trainer {
 
     /// Moves dead splats to live ones and adds some, so that the image stays the same. Returns how many splats there are then.
     fn relocate_and_grow(&mut self, settings: &McmcSettings) -> Result<usize, EngineError>;
+
+    /// Waits for all steps, takes what those with `accumulate_screen_gradients` have added up of each splat, and begins anew.
+    fn take_screen_gradients(&mut self) -> Result<ScreenGradients, EngineError>;
+
+    /// Holds all opacities to at most `max_opacity`, 0 to 1, and clears the moments that Adam keeps of them.
+    fn reset_opacities(&mut self, max_opacity: f32) -> Result<(), EngineError>;
 
     /// Begins with a fresh network; what the old one did to the poses stays in them.
     fn start_pose_network(&mut self, settings: &PoseNetworkSettings) -> Result<(), EngineError>;

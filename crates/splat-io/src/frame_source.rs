@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
+use crate::error::SourceError;
 use splat_types::frame::Frame;
+use splat_types::sparse_point::SparsePoint;
 use splat_types::transform::Rigid;
 
 /// What a source met so far; copied into `report.json`.
@@ -65,6 +67,11 @@ pub trait Source: Send {
 
     /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
     fn truth_extent(&self) -> Option<f64>;
+
+    /// Sparse points of the scene in the frame of the true poses, read when they are asked for; empty where it has none.
+    fn sparse_points(&self) -> Result<Vec<SparsePoint>, SourceError> {
+        Ok(Vec::new())
+    }
 
     /// Images come when the world makes them: those not taken in time are lost, so nothing may wait.
     fn is_live(&self) -> bool {

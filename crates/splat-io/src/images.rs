@@ -22,6 +22,7 @@ use crate::small_file::{natural_order, read_small};
 use splat_types::camera::CameraModel;
 use splat_types::depth::DepthMap;
 use splat_types::frame::Frame;
+use splat_types::sparse_point::SparsePoint;
 use splat_types::time::Stamp;
 use splat_types::transform::{Rigid, extent};
 
@@ -68,6 +69,8 @@ impl Entry {
 pub struct ImagesSource {
     entries: std::vec::IntoIter<Entry>,
     truth_extent: Option<f64>,
+    /// Of a scene of another program.
+    layout: Option<Layout>,
     max_frames: u64,
     intake: Intake,
 }
@@ -123,6 +126,7 @@ impl ImagesSource {
         Ok(Self {
             entries: entries.into_iter(),
             truth_extent: track.extent(),
+            layout: None,
             max_frames: params.max_frames,
             intake: Intake::new(params, lens_of(folder)),
         })
@@ -170,6 +174,7 @@ impl ImagesSource {
         Ok(Self {
             entries: entries.into_iter(),
             truth_extent: Some(extent(&centres)),
+            layout: Some(layout.clone()),
             max_frames: params.max_frames,
             intake: Intake::new(params, None),
         })
@@ -275,6 +280,10 @@ impl Source for ImagesSource {
 
     fn truth_extent(&self) -> Option<f64> {
         self.truth_extent
+    }
+
+    fn sparse_points(&self) -> Result<Vec<SparsePoint>, SourceError> {
+        self.layout.as_ref().map_or(Ok(Vec::new()), Layout::points)
     }
 }
 

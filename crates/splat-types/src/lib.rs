@@ -26,6 +26,8 @@ pub mod tracking;
 
 pub mod load_shed;
 
+pub mod sparse_point;
+
 pub mod splats;
 
 pub mod snapshot;

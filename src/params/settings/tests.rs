@@ -74,7 +74,23 @@ fn every_preset_is_shipped_and_names_known_keys() {
         Settings::shipped().merge_preset(&name).unwrap();
     }
     let error = Settings::shipped().merge_preset("papr").unwrap_err();
-    assert_eq!(error.to_string(), "\"papr\" is no preset, expected paper");
+    assert_eq!(
+        error.to_string(),
+        "\"papr\" is no preset, expected paper, 3dgs"
+    );
+}
+
+#[test]
+fn two_ways_to_grow_are_one_too_many() {
+    let mut settings = Settings::shipped();
+    settings.merge_preset("3dgs").unwrap();
+    settings.params().unwrap();
+    settings.merge_setting("mcmc.enabled=true").unwrap();
+    let error = settings.params().unwrap_err().to_string();
+    assert!(
+        error.contains("densify.enabled") && error.contains("mcmc.enabled"),
+        "{error}"
+    );
 }
 
 #[test]

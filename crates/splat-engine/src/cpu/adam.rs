@@ -10,6 +10,7 @@ use crate::cpu::adam_sh::{BAND_0, ShMoments};
 use crate::cpu::moments::{BETA_1, BETA_2, EPS, Moments, UpdateCounts, correction};
 use crate::cpu::project::{CHUNK, Projected};
 use crate::cpu::project_backward::SplatGradients;
+use crate::densify::ScreenGradients;
 use crate::settings::StepSettings;
 use splat_types::splats::rows::{make_room, retain_rows};
 use splat_types::splats::splats::Splats;
@@ -26,6 +27,7 @@ pub(crate) struct Optimiser {
     pub(crate) update_counts: Vec<UpdateCounts>,
     /// Number of the step that last saw the splat, or brought it.
     pub(crate) last_seen: Vec<u32>,
+    pub(crate) screen_gradients: ScreenGradients,
     /// Of the visible splats, after the update; `None`: left alone.
     updated: Vec<Option<UpdateCounts>>,
 }
@@ -60,6 +62,7 @@ impl Optimiser {
             moments.second.resize(n * stride, 0.0);
         }
         self.sh_above.resize(n, splats.sh_stride());
+        self.screen_gradients.resize(n);
     }
 
     pub(crate) fn retain(&mut self, sh_stride: usize, keep: &[bool]) {
@@ -70,6 +73,7 @@ impl Optimiser {
             retain_rows(&mut moments.second, stride, keep);
         }
         self.sh_above.retain(sh_stride, keep);
+        self.screen_gradients.retain(keep);
     }
 
     /// Puts the moments of splat `ix` to 0.
@@ -80,6 +84,13 @@ impl Optimiser {
             moments.second[ix * stride..(ix + 1) * stride].fill(0.0);
         }
         self.sh_above.clear(sh_stride, ix);
+        self.screen_gradients.clear(ix);
+    }
+
+    /// Puts the moments of all opacities to 0; bias correction goes on.
+    pub(crate) fn clear_opacities(&mut self) {
+        self.opacity_logits.first.fill(0.0);
+        self.opacity_logits.second.fill(0.0);
     }
 
     /// The moments of splat `ix` count as old as it is.
@@ -110,11 +121,13 @@ impl Optimiser {
     }
 
     /// Parameters included.
-    pub(crate) fn bytes_per_splat(sh_degree: u8) -> usize {
+    pub(crate) fn bytes_per_splat(&self, sh_degree: u8) -> usize {
         let n_sh = 3 * (usize::from(sh_degree) + 1).pow(2);
         let of_moments = 2 * (3 + 3 + 4 + 1 + BAND_0);
         let words = 3 + 3 + 4 + 1 + n_sh + 1 + of_moments + size_of::<UpdateCounts>() / 4 + 1;
-        4 * words + ShMoments::bytes_per_splat(sh_degree)
+        let accumulates = !self.screen_gradients.counts.is_empty();
+        let of_screen = if accumulates { 8 } else { 0 };
+        4 * words + ShMoments::bytes_per_splat(sh_degree) + of_screen
     }
 
     /// Room for more rows included.
@@ -129,6 +142,7 @@ impl Optimiser {
         let of_moments = |m: &&Moments| 4 * (m.first.capacity() + m.second.capacity());
         all.iter().map(of_moments).sum::<usize>()
             + self.sh_above.held_bytes()
+            + self.screen_gradients.held_bytes()
             + size_of::<UpdateCounts>() * self.update_counts.capacity()
             + 4 * self.last_seen.capacity()
     }

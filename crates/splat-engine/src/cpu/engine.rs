@@ -119,6 +119,11 @@ impl CpuEngine {
                 self.optimiser
                     .update_unseen(splats, settings, self.n_trained);
             }
+            if settings.accumulate_screen_gradients {
+                let size_px = [view.image.width_px, view.image.height_px];
+                let sums = &mut self.optimiser.screen_gradients;
+                sums.add(splats.len(), seen, g, size_px);
+            }
             crate::cpu::mcmc::add_noise(splats, seen, settings, self.n_trained);
         }
         self.count_troubles(n_skipped);

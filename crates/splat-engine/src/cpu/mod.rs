@@ -39,6 +39,8 @@ pub mod project_backward;
 
 mod pass;
 
+mod screen_gradients;
+
 mod moments;
 
 mod adam_sh;

@@ -20,6 +20,8 @@ pub struct SplatGradients {
     pub log_scales: Vec<[f32; 3]>,
     pub quats: Vec<[f32; 4]>,
     pub opacity_logits: Vec<f32>,
+    /// d loss / d projected mean, per pixel.
+    pub centers: Vec<[f32; 2]>,
     /// `sh_stride` numbers a splat, the active bands only.
     pub sh: Vec<f32>,
     pub sh_stride: usize,
@@ -80,12 +82,13 @@ pub fn project_backward(
         out.log_scales.par_chunks_mut(CHUNK),
         out.quats.par_chunks_mut(CHUNK),
         out.opacity_logits.par_chunks_mut(CHUNK),
+        out.centers.par_chunks_mut(CHUNK),
         out.sh.par_chunks_mut(CHUNK * stride),
         out.is_finite.par_chunks_mut(CHUNK),
         out.partials.par_iter_mut(),
     );
     chunks.into_par_iter().enumerate().for_each(
-        |(c, (visible, means, log_scales, quats, logits, sh, is_finite, partial))| {
+        |(c, (visible, means, log_scales, quats, logits, centers, sh, is_finite, partial))| {
             *partial = Partial::default();
             let mut sums = [InstanceGradient::default(); CHUNK];
             // All at once: the slots are scattered over memory, and in one short loop their loads overlap.
@@ -99,6 +102,7 @@ pub fn project_backward(
                 log_scales[k] = gradient.log_scale.as_vec3().to_array();
                 quats[k] = gradient.quat.map(|g| g as f32);
                 logits[k] = gradient.opacity_logit as f32;
+                centers[k] = sum.center;
                 let geometry = [&means[k][..], &log_scales[k], &quats[k], &logits[k..=k]];
                 is_finite[k] = geometry.iter().all(|part| all_finite(part)) && all_finite(sh);
                 if is_finite[k] {
@@ -348,6 +352,7 @@ impl SplatGradients {
         self.log_scales.resize(n, [0.0; 3]);
         self.quats.resize(n, [0.0; 4]);
         self.opacity_logits.resize(n, 0.0);
+        self.centers.resize(n, [0.0; 2]);
         self.sh.resize(n * self.sh_stride, 0.0);
         self.is_finite.resize(n, true);
         self.partials.resize(n.div_ceil(CHUNK), Partial::default());

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use crate::cpu::adam::Optimiser;
 use crate::cpu::engine::CpuEngine;
 use crate::cpu::project::Camera;
 use crate::cpu::view::View;
 use crate::cpu::{lanes, mcmc};
+use crate::densify::{self, ScreenGradients};
 use crate::error::EngineError;
 use crate::pose_network::PoseNetwork;
 use crate::settings::{McmcSettings, Memory, PoseNetworkSettings, StepSettings, StepStats};
@@ -47,8 +47,8 @@ impl Device for CpuEngine {
     fn capacity(&self, max_bytes: u64) -> usize {
         let of_views: usize = self.views.iter().map(View::held_bytes).sum();
         let free = (max_bytes as usize).saturating_sub(of_views);
-        (free as f64 / (MAX_SPARE * Optimiser::bytes_per_splat(self.splats.sh_degree) as f64))
-            as usize
+        let per_splat = self.optimiser.bytes_per_splat(self.splats.sh_degree);
+        (free as f64 / (MAX_SPARE * per_splat as f64)) as usize
     }
 }
 
@@ -219,6 +219,21 @@ impl Trainer for CpuEngine {
         let (splats, optimiser) = (&mut self.splats, &mut self.optimiser);
         mcmc::relocate_and_grow(splats, optimiser, settings, self.n_trained);
         Ok(self.splats.len())
+    }
+
+    fn take_screen_gradients(&mut self) -> Result<ScreenGradients, EngineError> {
+        let mut taken = std::mem::take(&mut self.optimiser.screen_gradients);
+        taken.sums.resize(self.splats.len(), 0.0);
+        taken.counts.resize(self.splats.len(), 0);
+        Ok(taken)
+    }
+
+    fn reset_opacities(&mut self, max_opacity: f32) -> Result<(), EngineError> {
+        let most = densify::logit(max_opacity);
+        let logits = self.splats.opacity_logits.iter_mut();
+        logits.for_each(|logit| *logit = logit.min(most));
+        self.optimiser.clear_opacities();
+        Ok(())
     }
 
     fn start_pose_network(&mut self, settings: &PoseNetworkSettings) -> Result<(), EngineError> {

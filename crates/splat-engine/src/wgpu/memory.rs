@@ -2,6 +2,7 @@
 //!
 //! 480 bytes a splat at SH degree 3. Each buffer grows by half; a row never changes its place unless `retain` says so.
 
+use crate::densify::ScreenGradients;
 use splat_gpu::buffer::Buffer;
 use splat_gpu::commands::Commands;
 use splat_gpu::device::Gpu;
@@ -16,6 +17,12 @@ const MIN_ROWS: usize = 1024;
 
 /// Where a row of `moments` has the updates in all.
 const AGE: usize = 19;
+/// Where it has the sum of the screen gradients, and how many they are.
+const SCREEN_SUM: usize = 27;
+const SCREEN_COUNT: usize = 31;
+/// Where rows of `geometry` and of `moments` have the opacity logit, and the second moment of it.
+const LOGIT: usize = 3;
+const LOGIT_SECOND: usize = 7;
 
 /// Buffers with room for `capacity` rows, of which `n` are splats.
 #[derive(Debug)]
@@ -165,6 +172,34 @@ impl SplatMemory {
             row[AGE] = f32::from(*age);
         }
         gpu.write(&self.moments, first * MOMENTS, &rows);
+    }
+
+    /// Reads the sums of the screen gradients and puts them to 0.
+    pub(crate) fn take_screen_gradients(&self, gpu: &Gpu) -> Result<ScreenGradients, GpuError> {
+        let mut rows: Vec<f32> = gpu.read(&self.moments, 0..self.n * MOMENTS)?;
+        let mut taken = ScreenGradients::default();
+        for row in rows.chunks_exact_mut(MOMENTS) {
+            taken.sums.push(row[SCREEN_SUM]);
+            taken.counts.push(row[SCREEN_COUNT] as u32);
+            (row[SCREEN_SUM], row[SCREEN_COUNT]) = (0.0, 0.0);
+        }
+        gpu.write(&self.moments, 0, &rows);
+        Ok(taken)
+    }
+
+    /// Holds the opacity logits to at most `max_logit` and clears their moments.
+    pub(crate) fn reset_opacities(&self, gpu: &Gpu, max_logit: f32) -> Result<(), GpuError> {
+        let mut rows: Vec<f32> = gpu.read(&self.geometry, 0..self.n * GEOMETRY)?;
+        let mut moments: Vec<f32> = gpu.read(&self.moments, 0..self.n * MOMENTS)?;
+        for row in rows.chunks_exact_mut(GEOMETRY) {
+            row[LOGIT] = row[LOGIT].min(max_logit);
+        }
+        for row in moments.chunks_exact_mut(MOMENTS) {
+            (row[LOGIT], row[LOGIT_SECOND]) = (0.0, 0.0);
+        }
+        gpu.write(&self.geometry, 0, &rows);
+        gpu.write(&self.moments, 0, &moments);
+        Ok(())
     }
 
     pub(crate) fn n_bytes(&self) -> u64 {

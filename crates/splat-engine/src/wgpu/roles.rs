@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::densify::{self, ScreenGradients};
 use crate::error::EngineError;
 use crate::settings::{McmcSettings, Memory, PoseNetworkSettings, StepSettings, StepStats};
 use crate::traits::{Device, Renderer, SplatBuffers, Trainer, ViewStore};
@@ -252,6 +253,21 @@ impl Trainer for WgpuEngine {
         });
         self.checked(result)?;
         Ok(self.memory.n)
+    }
+
+    fn take_screen_gradients(&mut self) -> Result<ScreenGradients, EngineError> {
+        let result = self
+            .confirm()
+            .and_then(|()| self.memory.take_screen_gradients(&self.gpu));
+        self.checked(result)
+    }
+
+    fn reset_opacities(&mut self, max_opacity: f32) -> Result<(), EngineError> {
+        let most = densify::logit(max_opacity);
+        let result = self
+            .confirm()
+            .and_then(|()| self.memory.reset_opacities(&self.gpu, most));
+        self.checked(result)
     }
 
     fn start_pose_network(&mut self, settings: &PoseNetworkSettings) -> Result<(), EngineError> {

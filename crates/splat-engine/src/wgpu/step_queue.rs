@@ -7,7 +7,7 @@ use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::passes;
 use crate::wgpu::types::{
     Camera, FLAG_ALL_SPLATS, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED,
-    FLAG_TRAIN_SPLATS, Step, TILE_PX,
+    FLAG_SCREEN_GRADIENTS, FLAG_TRAIN_SPLATS, Step, TILE_PX,
 };
 use splat_gpu::commands::Commands;
 use splat_gpu::error::GpuError;
@@ -151,6 +151,7 @@ impl WgpuEngine {
             | flag(s.moves_alone(), FLAG_POSE_DIRECT)
             | flag(s.pose == PoseMode::Shared, FLAG_POSE_SHARED)
             | flag(has_depth, FLAG_DEPTH)
+            | flag(s.accumulate_screen_gradients, FLAG_SCREEN_GRADIENTS)
             | flag(self.views.pose_network.is_some(), FLAG_POSE_NETWORK)
             | flag(s.train_splats && s.all_splats, FLAG_ALL_SPLATS);
         Step {

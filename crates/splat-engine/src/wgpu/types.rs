@@ -62,6 +62,7 @@ pub const FLAG_POSE_SHARED: u32 = 8;
 pub const FLAG_DEPTH: u32 = 16;
 pub const FLAG_POSE_NETWORK: u32 = 32;
 pub const FLAG_ALL_SPLATS: u32 = 64;
+pub const FLAG_SCREEN_GRADIENTS: u32 = 128;
 
 /// `Camera` of `shaders/lib/camera.wgsl`. Many fields: names of that struct.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]

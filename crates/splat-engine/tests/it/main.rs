@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
 mod backends;
+mod densify;
 mod engine;
 mod exposures;
 mod gpu;

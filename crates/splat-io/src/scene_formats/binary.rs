@@ -41,6 +41,10 @@ impl Binary {
         Ok(values)
     }
 
+    pub(crate) fn u8s<const N: usize>(&mut self, what: &str) -> Result<[u8; N], String> {
+        self.bytes(what)
+    }
+
     /// Up to a zero byte.
     pub(crate) fn name(&mut self) -> Result<String, String> {
         let mut bytes = Vec::new();

@@ -1,7 +1,6 @@
 //! A COLMAP model (`cameras` and `images`, binary or text) -> views.
 //!
-//! `points3D` is not read: landmarks are found again in the images as they are used. COLMAP's pixel centres lie at
-//! +0.5, as here; its poses are `cam_from_world`.
+//! COLMAP's pixel centres lie at +0.5, as here; its poses are `cam_from_world`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,7 +9,7 @@ use glam::{DQuat, DVec3};
 
 use crate::error::SourceError;
 use crate::scene_formats::binary::Binary;
-use crate::scene_formats::listed::{Listed, MAX_VIEWS, fault};
+use crate::scene_formats::listed::{Listed, MAX_VIEWS, excerpt, fault};
 use crate::small_file::read_small;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::transform::Rigid;
@@ -253,8 +252,4 @@ fn listed(
 
 fn is_content(line: &str) -> bool {
     !line.is_empty() && !line.starts_with('#')
-}
-
-fn excerpt(line: &str) -> String {
-    line.chars().take(60).collect()
 }

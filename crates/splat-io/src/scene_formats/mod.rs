@@ -6,6 +6,10 @@ mod listed;
 
 mod colmap;
 
+mod colmap_points;
+
+mod ply_points;
+
 mod image_files;
 
 mod transforms;

@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 
 use crate::error::SourceError;
 use crate::ground_truth::stamp_of_decimal;
-use crate::scene_formats::{colmap, image_files, transforms};
+use crate::scene_formats::{colmap, colmap_points, image_files, transforms};
 use crate::small_file::natural_order;
 use splat_types::camera::CameraModel;
+use splat_types::sparse_point::SparsePoint;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
@@ -38,7 +39,7 @@ pub struct SceneView {
 /// Where a scene lies and in which format.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Layout {
-    /// `cameras` and `images`, binary or text, in `model`.
+    /// `cameras`, `images` and perhaps `points3D`, binary or text, in `model`.
     Colmap { root: PathBuf, model: PathBuf },
     /// Files of training views, and of views for measuring.
     Transforms {
@@ -137,6 +138,14 @@ impl Layout {
                 name: view.name,
             });
         Ok(views.collect())
+    }
+
+    /// The sparse points in the frame of the poses; empty where the scene has none.
+    pub fn points(&self) -> Result<Vec<SparsePoint>, SourceError> {
+        match self {
+            Self::Colmap { model, .. } => colmap_points::read(model),
+            Self::Transforms { root, train, .. } => transforms::points(train, root),
+        }
     }
 }
 

@@ -9,10 +9,12 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 
 use crate::error::SourceError;
-use crate::scene_formats::image_files::Images;
-use crate::scene_formats::listed::{Listed, MAX_VIEWS, fault};
+use crate::scene_formats::image_files::{Images, inside};
+use crate::scene_formats::listed::{Listed, MAX_VIEWS, excerpt, fault};
+use crate::scene_formats::ply_points;
 use crate::small_file::read_small;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
+use splat_types::sparse_point::SparsePoint;
 use splat_types::transform::Rigid;
 
 /// A thousand bytes a frame, and thirty thousand frames.
@@ -48,6 +50,8 @@ struct File {
     #[serde(flatten)]
     camera: CameraKeys,
     applied_transform: Option<Vec<Vec<f64>>>,
+    /// Of a point cloud in the frame of the poses as they stand here.
+    ply_file_path: Option<String>,
     frames: Vec<FrameKeys>,
     test_filenames: Option<Vec<String>>,
 }
@@ -66,21 +70,12 @@ pub(crate) fn read(
     root: &Path,
     is_held_out: bool,
 ) -> Result<Vec<Listed>, SourceError> {
-    let fail = |reason: String| {
-        let way_out = "expected frames with file_path and a 4x4 transform_matrix";
-        fault("transforms.json", reason, way_out, path)
-    };
-    let bytes = read_small(path, MAX_FILE_BYTES).map_err(fail)?;
-    let file: File = serde_json::from_slice(&bytes).map_err(|e| fail(e.to_string()))?;
+    let fail = |reason: String| malformed(path, reason);
+    let file = parse(path)?;
     if file.frames.len() > MAX_VIEWS {
         return Err(fail(format!("{} frames", file.frames.len())));
     }
-    let undo = match &file.applied_transform {
-        Some(rows) => rigid_of(rows)
-            .ok_or_else(|| fail("applied_transform is no turn and shift".to_owned()))?
-            .inverse(),
-        None => Rigid::IDENTITY,
-    };
+    let undo = file.undo().map_err(fail)?;
     let names: Vec<&str> = file.frames.iter().map(|f| f.file_path.as_str()).collect();
     let is_sized = |camera: &CameraKeys| camera.w.is_some() && camera.h.is_some();
     let all_sized = is_sized(&file.camera) || file.frames.iter().all(|f| is_sized(&f.camera));
@@ -106,6 +101,50 @@ pub(crate) fn read(
         });
     }
     Ok(views)
+}
+
+/// Points of the PLY that the file names; empty where it names none.
+pub(crate) fn points(path: &Path, root: &Path) -> Result<Vec<SparsePoint>, SourceError> {
+    let file = parse(path)?;
+    let undo = file.undo().map_err(|reason| malformed(path, reason))?;
+    let Some(name) = &file.ply_file_path else {
+        return Ok(Vec::new());
+    };
+    let Some(cloud) = inside(root, name) else {
+        let reason = format!("ply_file_path {:?} leads out of its folder", excerpt(name));
+        return Err(malformed(path, reason));
+    };
+    let mut points = ply_points::read(&cloud).map_err(|reason| {
+        let way_out = "write it again, or start from depth (train.start=depth)";
+        fault("points of a transforms.json", reason, way_out, &cloud)
+    })?;
+    for point in &mut points {
+        point.position_in_gt = undo.transform_point(point.position_in_gt);
+    }
+    Ok(points)
+}
+
+fn parse(path: &Path) -> Result<File, SourceError> {
+    let fail = |reason: String| malformed(path, reason);
+    let bytes = read_small(path, MAX_FILE_BYTES).map_err(fail)?;
+    serde_json::from_slice(&bytes).map_err(|e| fail(e.to_string()))
+}
+
+fn malformed(path: &Path, reason: String) -> SourceError {
+    let way_out = "expected frames with file_path and a 4x4 transform_matrix";
+    fault("transforms.json", reason, way_out, path)
+}
+
+impl File {
+    /// From the frame of the file to that of its COLMAP model.
+    fn undo(&self) -> Result<Rigid, String> {
+        match &self.applied_transform {
+            Some(rows) => rigid_of(rows)
+                .map(|applied| applied.inverse())
+                .ok_or_else(|| "applied_transform is no turn and shift".to_owned()),
+            None => Ok(Rigid::IDENTITY),
+        }
+    }
 }
 
 impl CameraKeys {

@@ -33,6 +33,7 @@ use crate::mapper::splats::store::SplatSet;
 use crate::mapper::submaps::pose_anchor::ANCHOR_EVERY;
 use crate::mapper::submaps::registry::Submaps;
 use crate::mapper::train::schedule::End;
+use crate::mapper::train::start_points::StartPoints;
 use crate::mapper::train::trainer::Trainer;
 use crate::track::landmarks::KeyframeView;
 use splat_engine::error::EngineError;
@@ -42,6 +43,7 @@ use splat_geometry::answer::{GeometryBatch, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::frame::Batch;
 use splat_types::snapshot::Scale;
+use splat_types::sparse_point::SparsePoint;
 
 /// Keyframes without a pose that are kept in case the model places them later.
 pub const MAX_WAITING: usize = 200;
@@ -68,6 +70,8 @@ pub struct Mapper {
     splats: SplatSet,
     trainer: Trainer,
     scale: MetricScale,
+    /// Of the scene, with `train.start: points`.
+    start_points: StartPoints,
     /// `None` before anything was read.
     last_good: Option<Arc<LastGood>>,
 }
@@ -91,6 +95,7 @@ impl Mapper {
             splats: SplatSet::default(),
             trainer: Trainer::new(seed),
             scale: MetricScale::new(scale),
+            start_points: StartPoints::default(),
             last_good: None,
         }
     }
@@ -99,6 +104,14 @@ impl Mapper {
     #[must_use]
     pub fn measuring_scale(mut self, params: &ScaleParams) -> Self {
         self.scale.look_for(params);
+        self
+    }
+
+    /// With `train.start: points`, these become the first splats, as keyframes come that have them in view. They lie in the frame
+    /// and unit of the geometry's poses.
+    #[must_use]
+    pub fn starting_from(mut self, points: Vec<SparsePoint>) -> Self {
+        self.start_points = StartPoints::new(points);
         self
     }
 
@@ -199,6 +212,9 @@ impl Mapper {
             let may_move = may_change && mcmc.enabled && n_steps >= mcmc.start;
             if may_move && n_steps.is_multiple_of(mcmc.every) {
                 trainer.relocate(&mut parts)?;
+            }
+            if may_change {
+                trainer.densify_if_due(&mut parts)?;
             }
             self.report_renumbered();
             if n_steps.is_multiple_of(ROTATE_EVERY) {

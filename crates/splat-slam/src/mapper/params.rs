@@ -1,4 +1,4 @@
-//! Parameters of mapping: `map.*`, `train.*`, `mcmc.*`.
+//! Parameters of mapping: `map.*`, `train.*`, `mcmc.*`, `densify.*`.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,6 +11,7 @@ pub struct MapperParams {
     pub map: MapParams,
     pub train: TrainParams,
     pub mcmc: McmcParams,
+    pub densify: DensifyParams,
 }
 
 /// Parameters `map.*`: budgets of memory and disk, files, snapshots.
@@ -81,6 +82,13 @@ pub struct TrainParams {
     /// Share of the steps that are made after the last keyframe.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub final_share: f64,
+    /// What the first splats are made from: depth = the depth of each keyframe; points = the scene's sparse points (points3D of a
+    /// COLMAP model, ply_file_path of a transforms.json), with geometry ground_truth, and no splat from depth.
+    pub start: Start,
+    /// Scale of a splat that starts from a point, as a multiple of the distance to its three nearest neighbours; 1 in 3DGS,
+    /// 0.1 in 3DGS-MCMC.
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub start_scale: f32,
     /// Splats that a keyframe may add where the map has none yet.
     #[schemars(range(min = 1, max = 1000000))]
     pub seeds_per_keyframe: usize,
@@ -90,11 +98,31 @@ pub struct TrainParams {
     /// Share of 1 - SSIM in the photometric loss.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub ssim_weight: f32,
+    /// What SSIM takes for the pixels beyond the edges: black; or only windows inside the image are averaged (gsplat).
+    pub ssim_padding: SsimPadding,
+    /// Weight of the photometric loss; 0.95 in the code of FastSplatting.
+    #[schemars(range(min = 0.01, max = 100.0))]
+    pub photo_weight: f32,
     /// Weights of the further terms of the loss, each under its own name: `train.depth_weight` and what else the engine declares.
     #[serde(flatten)]
     pub weights: LossWeights,
     /// What the depth loss compares: inverse depth; as the code of FastSplatting; as its paper.
     pub depth_mode: DepthLoss,
+    /// Weight of the depth loss at the last step, as a share of that at the first; 1 = constant.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub final_depth_weight: f32,
+    /// What rates of means and translations, mcmc.scale_reg and train.near are shares of: the median depth of the views; or the
+    /// largest distance of a camera to the mean of all (3DGS).
+    pub scene_scale: SceneScale,
+    /// Splats nearer than this share of the scene scale to a camera are neither drawn nor trained; 0 = 0.01 map units.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub near: f32,
+    /// Steps between looks at a view for holes and errors to seed; 0 = only new keyframes bring splats.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub reseed_every: u64,
+    /// Size, opacity and rotation of splats seeded from depth: by their spacing in the image; or as gsplat starts 3DGS-MCMC, by the
+    /// distance to their three nearest neighbours in the map.
+    pub seed_shape: SeedShape,
     /// Weight of the epipolar distance in px over the correspondences of a view (3R-GS); 0 = off.
     #[schemars(range(min = 0.0, max = 100.0))]
     pub epipolar_weight: f32,
@@ -131,6 +159,8 @@ pub struct TrainParams {
     /// Updates of a splat before each further band of its colour is trained; 0 = all from the first.
     #[schemars(range(min = 0, max = 1000000))]
     pub sh_interval: u32,
+    /// What train.sh_interval counts: updates of a splat; or steps of the whole run (3DGS).
+    pub sh_interval_of: ShInterval,
     /// Pose optimisation: per view, by a shared MLP (3R-GS) and per view, or none.
     pub pose_opt: PoseOptimization,
     /// Adam rate of a view's own rotation, pose_opt per_view and network; decays to 3 % over the run; 0 fixes it.
@@ -142,6 +172,11 @@ pub struct TrainParams {
     /// Adam rate of the network and of its embedding of each view, pose_opt network.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_pose_network: f32,
+    /// Rates of poses and of the focal length at the last step, as a share of those at the first; 1 = constant.
+    #[schemars(range(min = 0.001, max = 1.0))]
+    pub final_pose_rate: f32,
+    /// What the network knows of a view at first: its place in the order of arrival; or nothing (3R-GS).
+    pub pose_embedding: PoseEmbedding,
     /// Adam rate of the logarithm of one factor on all focal lengths; 0 fixes it.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_focal: f32,
@@ -156,14 +191,23 @@ impl Default for TrainParams {
             steps: 3000,
             max_side: 480,
             final_share: 0.5,
+            start: Start::Depth,
+            start_scale: 1.0,
             seeds_per_keyframe: 5000,
             sh_degree: 3,
             ssim_weight: 0.2,
+            ssim_padding: SsimPadding::Zero,
+            photo_weight: 1.0,
             weights: LossWeights {
                 depth_weight: 0.1,
                 ..LossWeights::default()
             },
             depth_mode: DepthLoss::InvDepth,
+            final_depth_weight: 0.1,
+            scene_scale: SceneScale::MedianDepth,
+            near: 0.0,
+            reseed_every: 50,
+            seed_shape: SeedShape::Spacing,
             epipolar_weight: 0.0,
             robust_inlier_fraction: 1.0,
             lr_mean: 0.0012,
@@ -175,10 +219,13 @@ impl Default for TrainParams {
             half_rate_steps: 30,
             final_rate: 0.2,
             sh_interval: 0,
+            sh_interval_of: ShInterval::Updates,
             pose_opt: PoseOptimization::PerView,
             lr_rotation: 0.0005,
             lr_translation: 0.0005,
             lr_pose_network: 0.001,
+            final_pose_rate: 0.03,
+            pose_embedding: PoseEmbedding::Order,
             lr_focal: 0.0,
             lr_exposure: 0.0,
         }
@@ -197,6 +244,12 @@ pub struct McmcParams {
     /// Step of the first relocation.
     #[schemars(range(min = 0, max = 10000000))]
     pub start: u64,
+    /// Share of the steps after the last keyframe after which splats are neither moved, added, seeded nor removed; 1 = to the end.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub until: f32,
+    /// Noise, regularisers, Adam's moments and moves take in all splats, and not only those that views see (3DGS-MCMC); with
+    /// mcmc.enabled.
+    pub all_splats: bool,
     /// Splats after a relocation as a multiple of those before, up to map.max_splats.
     #[schemars(range(min = 1.0, max = 2.0))]
     pub growth: f32,
@@ -223,6 +276,8 @@ impl Default for McmcParams {
             enabled: false,
             every: 100,
             start: 500,
+            until: 0.6,
+            all_splats: false,
             growth: 1.05,
             relocation: RelocationRule::Image,
             noise: 67000.0,
@@ -231,6 +286,66 @@ impl Default for McmcParams {
             min_opacity: 0.02,
         }
     }
+}
+
+/// Parameters `densify.*`: growth by a threshold on gradients (3D Gaussian Splatting).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct DensifyParams {
+    /// Splats with large screen gradients are cloned or split, faint and too large ones removed, opacities reset (3DGS);
+    /// without mcmc.enabled.
+    pub enabled: bool,
+    /// Step after which the first splats are cloned and split.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub start: u64,
+    /// Step from which on none are, nor opacities reset; at 60 % of the steps after the last keyframe at the latest.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub until: u64,
+    /// Steps between passes.
+    #[schemars(range(min = 1, max = 1000000))]
+    pub every: u64,
+    /// Mean norm of the loss's gradient by the projected mean, in normalised device coordinates, from which on a splat is
+    /// cloned or split.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub gradient: f32,
+    /// Splats up to this largest scale are cloned, larger ones split; share of the radius of the cameras.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub dense_share: f32,
+    /// Splats above this largest scale are removed once opacities were reset; share of the radius of the cameras; 0 = none.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub max_share: f32,
+    /// Steps between resets of all opacities to twice min_opacity at most; 0 = none.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub opacity_reset_every: u64,
+    /// Splats below it are removed in each pass.
+    #[schemars(range(min = 0.0, max = 0.25))]
+    pub min_opacity: f32,
+}
+
+impl Default for DensifyParams {
+    fn default() -> Self {
+        Self {
+            enabled: false,
+            start: 500,
+            until: 15_000,
+            every: 100,
+            gradient: 0.0002,
+            dense_share: 0.01,
+            max_share: 0.1,
+            opacity_reset_every: 3000,
+            min_opacity: 0.005,
+        }
+    }
+}
+
+/// What the first splats are made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// The depth of each keyframe.
+    Depth,
+    /// The sparse points of the scene.
+    Points,
 }
 
 /// How keyframe poses are optimised with the splats.
@@ -265,4 +380,54 @@ pub enum RelocationRule {
     Image,
     /// The opacity along a ray through its centre (3DGS-MCMC).
     Paper,
+}
+
+/// What SSIM takes for the pixels beyond the edges of the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SsimPadding {
+    /// Black.
+    Zero,
+    /// Nothing: only windows that lie in the image are averaged (gsplat).
+    Valid,
+}
+
+/// The length that rates are shares of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SceneScale {
+    /// Median depth of the views.
+    MedianDepth,
+    /// Largest distance of a camera to the mean of all (3DGS).
+    Cameras,
+}
+
+/// Size, opacity and rotation of seeds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SeedShape {
+    /// As wide as their spacing in the image.
+    Spacing,
+    /// A tenth of the distance to the three nearest neighbours, opacity 0.5, turned at random (gsplat for 3DGS-MCMC).
+    Neighbours,
+}
+
+/// What admits bands of colour.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ShInterval {
+    /// Updates of each splat.
+    Updates,
+    /// Steps of the run.
+    Steps,
+}
+
+/// What the pose network knows of a view at first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseEmbedding {
+    /// Its place in the order of arrival.
+    Order,
+    /// Nothing (3R-GS).
+    Zero,
 }

@@ -3,6 +3,7 @@
 
 pub mod adam;
 pub mod bin;
+pub mod densify;
 pub mod differences;
 pub mod doubt;
 pub mod hostile;

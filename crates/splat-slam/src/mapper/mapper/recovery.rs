@@ -31,9 +31,12 @@ impl Mapper {
         self.submaps.anchor().clear();
         let Some(good) = self.last_good.clone() else {
             self.forget_all();
+            self.start_points.release(|_| false);
             return Ok(());
         };
         self.keyframes.restore(&good.keyframes);
+        let registered = self.keyframes.registered();
+        self.start_points.release(|id| registered.contains_key(&id));
         self.submaps.restore(&good.submaps);
         let snapshot = &good.snapshot;
         self.splats.restore_from(&snapshot.splat_ids, &good.on_disk);

@@ -6,6 +6,8 @@ use crate::mapper::keyframes::registered::{DepthFit, RegisteredKeyframe};
 use crate::mapper::keyframes::residency::Residency;
 use crate::mapper::keyframes::training_image::{rescaled, training_image};
 use crate::mapper::mapper::Mapper;
+use crate::mapper::params::Start;
+use crate::mapper::parts::Parts;
 use crate::mapper::train::landmark_depth::landmark_depth;
 use crate::track::landmarks::TriangulatedLandmarks;
 use splat_engine::error::EngineError;
@@ -118,8 +120,24 @@ impl Mapper {
         };
         self.share_budget();
         self.splats.prune(&self.params, &mut *self.engine)?;
+        self.bring_points(&new.fresh)?;
         self.seed_all(&new.fresh, &new.deepened)?;
         self.seed_provisional(&new.fresh, world_per_unit, observations)
+    }
+
+    fn bring_points(&mut self, fresh: &[u32]) -> Result<(), EngineError> {
+        if self.params.train.start != Start::Points {
+            return Ok(());
+        }
+        let mut parts = Parts {
+            params: &self.params,
+            engine: &mut *self.engine,
+            keyframes: &mut self.keyframes,
+            splats: &mut self.splats,
+        };
+        self.start_points.bring(&mut parts, fresh)?;
+        self.report_renumbered();
+        Ok(())
     }
 
     fn seed_all(&mut self, fresh: &[u32], deepened: &[u32]) -> Result<(), EngineError> {
@@ -129,7 +147,12 @@ impl Mapper {
         let has_depth = |id: &&u32| self.keyframes.registered()[*id].depth.width_px > 0;
         let fresh: Vec<u32> = fresh.iter().filter(has_depth).copied().collect();
         let n = fresh.len() + deepened.len();
-        self.balance(n * self.params.train.seeds_per_keyframe)?;
+        // Points are placed by now, and depth brings none beside them.
+        let per_keyframe = match self.params.train.start {
+            Start::Depth => self.params.train.seeds_per_keyframe,
+            Start::Points => 0,
+        };
+        self.balance(n * per_keyframe)?;
         let (mut parts, trainer) = self.split();
         trainer.seed_each(&mut parts, &fresh, false)?;
         trainer.seed_each(&mut parts, deepened, true)?;

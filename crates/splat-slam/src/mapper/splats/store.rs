@@ -156,7 +156,8 @@ impl SplatSet {
         Ok(())
     }
 
-    /// Removes splats that have become transparent or lost their numbers; the transparent ones move with MCMC.
+    /// Removes splats that have become transparent or lost their numbers; the transparent ones move with MCMC, and densification
+    /// removes them itself, as it makes all of them nearly transparent now and then.
     pub(crate) fn prune(
         &mut self,
         params: &MapperParams,
@@ -165,7 +166,8 @@ impl SplatSet {
         let splats = engine.read()?;
         let min_opacity = params.mcmc.min_opacity.clamp(1e-6, 1.0 - 1e-6);
         let min_logit = (min_opacity / (1.0 - min_opacity)).ln();
-        let is_alive = |i: usize| params.mcmc.enabled || splats.opacity_logits[i] > min_logit;
+        let keeps_faint = params.mcmc.enabled || params.densify.enabled;
+        let is_alive = |i: usize| keeps_faint || splats.opacity_logits[i] > min_logit;
         let keep: Vec<bool> = (0..splats.len())
             .map(|i| splats.is_finite(i) && is_alive(i))
             .collect();

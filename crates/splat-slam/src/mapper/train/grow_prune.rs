@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use rand::Rng;
 
-use crate::mapper::params::RelocationRule;
+use crate::mapper::params::{RelocationRule, Start};
 use crate::mapper::parts::Parts;
 use crate::mapper::splats::seeds::{Guess, Seeds};
 use crate::mapper::train::seed::{self, SeedView};
@@ -26,13 +26,16 @@ const MIN_ACTIVE_STEPS: usize = 500;
 /// A guess that is off by a smaller part of its depth lies on the surface: steps move it the rest of the way.
 const SAME_SURFACE: f64 = 0.02;
 
-/// Splats where a keyframe's depth says that the map has a hole or is wrong.
+/// Splats where a keyframe's depth says that the map has a hole or is wrong; none where the scene's points are the start.
 pub(crate) fn seed_from(
     map: &mut Parts<'_>,
     rng: &mut impl Rng,
     keyframe_id: u32,
     fills_gaps: bool,
 ) -> Result<(), EngineError> {
+    if map.params.train.start == Start::Points {
+        return Ok(());
+    }
     let registered = map.keyframes.registered().get(&keyframe_id);
     let Some(depth) = registered.map(|registered| Arc::clone(&registered.depth)) else {
         return Ok(());
@@ -49,6 +52,9 @@ pub(crate) fn seed_provisional(
     keyframe_id: u32,
     depth: &DepthMap,
 ) -> Result<(), EngineError> {
+    if map.params.train.start == Start::Points {
+        return Ok(());
+    }
     let budget = map.params.train.seeds_per_keyframe;
     let mut seeds = seeds(map, rng, (keyframe_id, depth), true, budget)?;
     seeds.is_guess.fill(true);

@@ -20,4 +20,10 @@ mod transient;
 
 pub(crate) mod grow_prune;
 
+mod nearest;
+
+pub(crate) mod start_points;
+
+mod densify;
+
 pub(crate) mod trainer;

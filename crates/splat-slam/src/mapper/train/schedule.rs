@@ -18,8 +18,6 @@ const OLD_RATE: f32 = 0.1;
 const STEPS_BEFORE_FILLING: u32 = 4;
 /// Rates at the last step, as a share of those at the first.
 const FINAL_MEAN_RATE: f32 = 0.01;
-const FINAL_POSE_RATE: f32 = 0.03;
-const FINAL_DEPTH_WEIGHT: f32 = 0.1;
 /// First pose rate as a share of the standard deviation that the model states: a few steps of a view cover it.
 const RATE_OF_ERROR: f32 = 0.5;
 /// Rate of the SH bands above the base, as a share of the base rate (3DGS).
@@ -153,15 +151,20 @@ pub fn settings(
         0 => 1.0,
         half => (1.0 / (1.0 + n_steps as f32 / half as f32)).max(OLD_RATE),
     };
+    let final_pose = params.train.final_pose_rate;
     let of_splats = |rate: f32| aged * decayed(rate, params.train.final_rate);
     let lr_mean = aged * decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
     // Terms that have no say below have the weight of the parameters.
     let mut weights = params.train.weights;
-    weights.depth_weight = decayed(weights.depth_weight, FINAL_DEPTH_WEIGHT);
-    weights.opacity_reg = if_mcmc(params.mcmc.opacity_reg);
+    // Adam is blind to a factor on the whole loss: less of the photometric term is more of all others.
+    let per_photo = 1.0 / params.train.photo_weight;
+    let final_depth = params.train.final_depth_weight;
+    weights.depth_weight = per_photo * decayed(weights.depth_weight, final_depth);
+    weights.opacity_reg = per_photo * if_mcmc(params.mcmc.opacity_reg);
     // A scale is a length: its share of the scene is what has a size.
-    weights.scale_reg = if_mcmc(params.mcmc.scale_reg / scene_depth.max(f32::MIN_POSITIVE));
+    let scale_reg = params.mcmc.scale_reg / scene_scale.max(f32::MIN_POSITIVE);
+    weights.scale_reg = per_photo * if_mcmc(scale_reg);
     StepSettings {
         lr_mean,
         lr_mean_decay: settling(params, end),
@@ -172,14 +175,14 @@ pub fn settings(
         lr_sh_rest: of_splats(params.train.lr_sh * SH_REST_RATE),
         lr_pose_rotation: decayed(
             raised(params.train.lr_rotation, pose_error[0]),
-            FINAL_POSE_RATE,
+            final_pose,
         ),
         lr_pose_translation: decayed(
             raised(params.train.lr_translation * scene_depth, pose_error[1]),
-            FINAL_POSE_RATE,
+            final_pose,
         ),
-        lr_pose_network: decayed(params.train.lr_pose_network, FINAL_POSE_RATE),
-        lr_focal: decayed(params.train.lr_focal, FINAL_POSE_RATE),
+        lr_pose_network: decayed(params.train.lr_pose_network, final_pose),
+        lr_focal: decayed(params.train.lr_focal, final_pose),
         lr_exposure: params.train.lr_exposure,
         ssim_weight: params.train.ssim_weight,
         weights,

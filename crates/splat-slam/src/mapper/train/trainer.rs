@@ -6,6 +6,7 @@ use rand_pcg::Pcg64Mcg;
 use crate::mapper::parts::Parts;
 use crate::mapper::train::convergence::Convergence;
 use crate::mapper::train::correspondences::SeenLandmarks;
+use crate::mapper::train::densify;
 use crate::mapper::train::grow_prune;
 use crate::mapper::train::loss_curve::LossCurve;
 use crate::mapper::train::photometric::{self, FrameFit};
@@ -124,7 +125,9 @@ impl Trainer {
         };
         let (scene_depth, pose_error) = (map.keyframes.scene_depth(), map.keyframes.pose_error());
         let n_steps = self.schedule.steps_of(view_ix);
-        let settings = schedule::settings(map.params, scene_depth, pose_error, end, n_steps);
+        let mut settings = schedule::settings(map.params, scene_depth, pose_error, end, n_steps);
+        settings.accumulate_screen_gradients =
+            densify::accumulates(&map.params.densify, self.n_steps);
         map.engine.step(view_ix, &settings)?;
         self.n_steps += 1;
         Ok(Some(settings))
@@ -198,6 +201,11 @@ impl Trainer {
 
     pub(crate) fn relocate(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
         grow_prune::relocate(map, self.trainable.len(), self.seed ^ self.n_steps)
+    }
+
+    /// Clones, splits and removes splats, and resets opacities, where that is due.
+    pub(crate) fn densify_if_due(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        densify::densify_if_due(map, self.n_steps, self.seed)
     }
 
     /// The pose near `world_from_cam` at which the map looks most like `image`; `None` where no pose is clearly better.
