@@ -27,7 +27,7 @@ use crate::mapper::last_good::LastGood;
 use crate::mapper::metric_scale::MetricScale;
 use crate::mapper::metric_scale_params::ScaleParams;
 use crate::mapper::pages::{PageStore, Paging};
-use crate::mapper::params::{MapperParams, PoseOptimization};
+use crate::mapper::params::{MapperParams, PoseEmbedding, PoseOptimization};
 use crate::mapper::parts::Parts;
 use crate::mapper::splats::store::SplatSet;
 use crate::mapper::submaps::pose_anchor::ANCHOR_EVERY;
@@ -37,7 +37,7 @@ use crate::mapper::train::start_points::StartPoints;
 use crate::mapper::train::trainer::Trainer;
 use crate::track::landmarks::KeyframeView;
 use splat_engine::error::EngineError;
-use splat_engine::settings::PoseMode;
+use splat_engine::settings::{FirstEmbedding, PoseMode};
 use splat_engine::traits::Engine;
 use splat_geometry::answer::{GeometryBatch, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
@@ -47,13 +47,11 @@ use splat_types::sparse_point::SparsePoint;
 
 /// Keyframes without a pose that are kept in case the model places them later.
 pub const MAX_WAITING: usize = 200;
-/// Steps between looks at a view for holes and errors, and between removals of transparent splats.
-const RESEED_EVERY: u64 = 50;
+/// Steps between looks at a view for what moved in it, where it is not looked at to seed, and between removals of transparent splats.
+const MASK_EVERY: u64 = 50;
 const PRUNE_EVERY: u64 = 400;
 /// Steps between looks at the depth of one view, while more views are to come: they wait for nothing that takes long.
 const SCALE_ONE_EVERY: u64 = 3;
-/// Seeding and removal end here, as a share of the final steps: what comes later has no time to converge.
-const LAST_RESEED: f32 = 0.6;
 
 /// Is given the map and the ids of keyframes that are new in it.
 pub type OnPoses<'a> = dyn FnMut(&mut Mapper, &[u32]) -> Result<(), EngineError> + 'a;
@@ -179,6 +177,7 @@ impl Mapper {
         self.share_budget();
         self.keyframes.subsample_old_depth(&mut *self.engine)?;
         let (mut parts, trainer) = self.split();
+        trainer.measure_scene(&mut parts)?;
         trainer.match_views(&mut parts)?;
         self.set_anchor()?;
         self.splats.note_peaks(&*self.engine);
@@ -200,8 +199,13 @@ impl Mapper {
                 return Ok(done);
             };
             let n_steps = trainer.n_steps();
-            let may_change = !matches!(end, End::Nears(share) if share > LAST_RESEED);
-            if may_change && n_steps.is_multiple_of(RESEED_EVERY) {
+            let train = &parts.params.train;
+            let may_change = !matches!(end, End::Nears(share) if share > train.refine_until);
+            let look_every = match train.reseed_every {
+                0 => MASK_EVERY,
+                every => every,
+            };
+            if may_change && n_steps.is_multiple_of(look_every) {
                 trainer.seed_and_mask(&mut parts, end)?;
             }
             trainer.record_loss_at_interval(parts.engine)?;
@@ -334,7 +338,11 @@ impl Mapper {
 
     fn set_anchor(&mut self) -> Result<(), EngineError> {
         let has_network = self.params.train.pose_opt == PoseOptimization::Network;
-        let seed = has_network.then_some(self.seed);
+        let embedding = match self.params.train.pose_embedding {
+            PoseEmbedding::Order => FirstEmbedding::Order,
+            PoseEmbedding::Zero => FirstEmbedding::Zero,
+        };
+        let seed = has_network.then_some((self.seed, embedding));
         let anchor = self.submaps.anchor();
         anchor.set(seed, &self.keyframes, &mut *self.engine)
     }

@@ -120,6 +120,9 @@ pub struct TrainParams {
     /// Steps between looks at a view for holes and errors to seed; 0 = only new keyframes bring splats.
     #[schemars(range(min = 0, max = 1000000))]
     pub reseed_every: u64,
+    /// Share of the steps after the last keyframe behind which splats are neither added, moved nor removed; 1 = to the end.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub refine_until: f32,
     /// Size, opacity and rotation of splats seeded from depth: by their spacing in the image; or as gsplat starts 3DGS-MCMC, by the
     /// distance to their three nearest neighbours in the map.
     pub seed_shape: SeedShape,
@@ -207,6 +210,7 @@ impl Default for TrainParams {
             scene_scale: SceneScale::MedianDepth,
             near: 0.0,
             reseed_every: 50,
+            refine_until: 0.6,
             seed_shape: SeedShape::Spacing,
             epipolar_weight: 0.0,
             robust_inlier_fraction: 1.0,
@@ -244,9 +248,6 @@ pub struct McmcParams {
     /// Step of the first relocation.
     #[schemars(range(min = 0, max = 10000000))]
     pub start: u64,
-    /// Share of the steps after the last keyframe after which splats are neither moved, added, seeded nor removed; 1 = to the end.
-    #[schemars(range(min = 0.0, max = 1.0))]
-    pub until: f32,
     /// Noise, regularisers, Adam's moments and moves take in all splats, and not only those that views see (3DGS-MCMC); with
     /// mcmc.enabled.
     pub all_splats: bool,
@@ -276,7 +277,6 @@ impl Default for McmcParams {
             enabled: false,
             every: 100,
             start: 500,
-            until: 0.6,
             all_splats: false,
             growth: 1.05,
             relocation: RelocationRule::Image,

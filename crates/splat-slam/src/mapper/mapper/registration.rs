@@ -122,7 +122,9 @@ impl Mapper {
         self.splats.prune(&self.params, &mut *self.engine)?;
         self.bring_points(&new.fresh)?;
         self.seed_all(&new.fresh, &new.deepened)?;
-        self.seed_provisional(&new.fresh, world_per_unit, observations)
+        self.seed_provisional(&new.fresh, world_per_unit, observations)?;
+        let (mut parts, trainer) = self.split();
+        trainer.reshape_fresh(&mut parts)
     }
 
     fn bring_points(&mut self, fresh: &[u32]) -> Result<(), EngineError> {

@@ -61,11 +61,11 @@ impl PoseAnchor {
         self.n_put_back
     }
 
-    /// After views were registered: remembers where the map lies, and starts the network, if there is a seed for one,
+    /// After views were registered: remembers where the map lies, and starts the network, if there is a seed and a first embedding for one,
     /// where it is due.
     pub(crate) fn set(
         &mut self,
-        network_seed: Option<u64>,
+        network: Option<(u64, FirstEmbedding)>,
         keyframes: &KeyframeStore,
         engine: &mut dyn Engine,
     ) -> Result<(), EngineError> {
@@ -74,9 +74,9 @@ impl PoseAnchor {
         let spread = spread(keyframes, &map_poses);
         let old = self.state.map_or(0.0, |state| state.network_scale);
         let is_due = spread > RESTART_GROWTH * old;
-        if let Some(seed) = network_seed.filter(|_| is_due) {
+        if let Some((seed, embedding)) = network.filter(|_| is_due) {
             engine.start_pose_network(&PoseNetworkSettings {
-                embedding: FirstEmbedding::Order,
+                embedding,
                 seed,
                 camera_scale: spread as f32,
             })?;

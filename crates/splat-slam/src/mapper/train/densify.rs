@@ -1,15 +1,12 @@
 //! Splats come and go by the threshold on their screen gradients (3D Gaussian Splatting, Kerbl et al. 2023): when, and with which
 //! lengths. Who is cloned, split or removed is `splat_engine::densify`'s.
 
-use glam::DVec3;
-
 use crate::mapper::params::DensifyParams;
 use crate::mapper::parts::Parts;
+use crate::mapper::train::scene_extent::scene_radius;
 use splat_engine::densify::{self, DensifySettings, Fate};
 use splat_engine::error::EngineError;
 
-/// Radius of the scene as a multiple of the largest distance of a camera from their mean, as the authors have it.
-const RADIUS_OF_CAMERAS: f64 = 1.1;
 /// Opacities are held to this multiple of the least one, 0.01 in 3DGS: what is needed has time to come back.
 const RESET_OF_MIN_OPACITY: f32 = 2.0;
 
@@ -96,30 +93,6 @@ fn densify(map: &mut Parts<'_>, n_steps: u64, seed: u64) -> Result<(), EngineErr
     Ok(())
 }
 
-/// Of the cameras that are trained on, in world units.
-fn scene_radius(map: &mut Parts<'_>) -> Result<f32, EngineError> {
-    let poses = map.engine.poses()?;
-    let trained = map.keyframes.registered().values();
-    let centres: Vec<DVec3> = trained
-        .filter(|registered| !registered.is_held_out)
-        .map(|registered| poses[registered.view_ix].inverse().translation)
-        .collect();
-    let radius = radius_of(&centres) as f32;
-    // One camera, or several in one place: the depth of what they show is the only length.
-    let has_motion = radius > f32::EPSILON * map.keyframes.scene_depth();
-    Ok(if has_motion {
-        radius
-    } else {
-        map.keyframes.scene_depth()
-    })
-}
-
-fn radius_of(centres: &[DVec3]) -> f64 {
-    let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
-    let away = centres.iter().map(|centre| centre.distance(mean));
-    RADIUS_OF_CAMERAS * away.fold(0.0, f64::max)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -148,12 +121,5 @@ mod tests {
             ..params
         };
         assert!(!due(&never, 3000).resets && due(&never, 3000).densifies);
-    }
-
-    #[test]
-    fn the_scene_is_a_little_larger_than_the_ring_of_its_cameras() {
-        let ring = [DVec3::X, -DVec3::X, DVec3::Y, -DVec3::Y].map(|p| 2.0 * p + DVec3::Z);
-        assert!((radius_of(&ring) - 2.2).abs() < 1e-12);
-        assert_eq!(radius_of(&[]), 0.0);
     }
 }

@@ -138,6 +138,7 @@ pub(crate) fn relocate(
     seed: u64,
 ) -> Result<(), EngineError> {
     let active_steps = (ACTIVE_ROUNDS * n_trainable).max(MIN_ACTIVE_STEPS);
+    let is_over_all = map.params.mcmc.all_splats;
     let settings = McmcSettings {
         min_opacity: map.params.mcmc.min_opacity,
         copies: match map.params.mcmc.relocation {
@@ -146,8 +147,8 @@ pub(crate) fn relocate(
         },
         max_splats: map.splats.cap(map.params, map.keyframes, map.engine),
         growth: map.params.mcmc.growth,
-        active_steps: active_steps as u32,
-        keeps_age: false,
+        active_steps: if is_over_all { 0 } else { active_steps as u32 },
+        keeps_age: is_over_all,
         seed: seed as u32,
     };
     map.engine.relocate_and_grow(&settings)?;

@@ -22,7 +22,11 @@ pub(crate) mod grow_prune;
 
 mod nearest;
 
+mod seed_shape;
+
 pub(crate) mod start_points;
+
+mod scene_extent;
 
 mod densify;
 

@@ -4,7 +4,7 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization};
+use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization, ShInterval, SsimPadding};
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
 /// Steps that every view gets soon, the newest first: what was seen is to be shown. While some lack them they take so large a
@@ -124,12 +124,12 @@ pub fn due(params: &MapperParams, progress: f64) -> u64 {
     (params.train.steps as f64 * (1.0 - params.train.final_share) * progress.clamp(0.0, 1.0)) as u64
 }
 
-/// Numbers of one step. `scene_depth` is the median depth of the views in map units: lengths scale with it.
+/// Numbers of one step. `scene_scale` is a length of the scene in map units: rates of lengths are shares of it.
 /// `pose_error` is what the model says that poses may be off by, in radians and map units: the farther, the faster.
 /// `n_steps`: on the view so far.
 pub fn settings(
     params: &MapperParams,
-    scene_depth: f32,
+    scene_scale: f32,
     pose_error: [f32; 2],
     end: End,
     n_steps: u32,
@@ -153,7 +153,7 @@ pub fn settings(
     };
     let final_pose = params.train.final_pose_rate;
     let of_splats = |rate: f32| aged * decayed(rate, params.train.final_rate);
-    let lr_mean = aged * decayed(params.train.lr_mean * scene_depth, FINAL_MEAN_RATE);
+    let lr_mean = aged * decayed(params.train.lr_mean * scene_scale, FINAL_MEAN_RATE);
     let if_mcmc = |value: f32| if params.mcmc.enabled { value } else { 0.0 };
     // Terms that have no say below have the weight of the parameters.
     let mut weights = params.train.weights;
@@ -173,12 +173,9 @@ pub fn settings(
         lr_opacity: of_splats(params.train.lr_opacity),
         lr_sh0: of_splats(params.train.lr_sh),
         lr_sh_rest: of_splats(params.train.lr_sh * SH_REST_RATE),
-        lr_pose_rotation: decayed(
-            raised(params.train.lr_rotation, pose_error[0]),
-            final_pose,
-        ),
+        lr_pose_rotation: decayed(raised(params.train.lr_rotation, pose_error[0]), final_pose),
         lr_pose_translation: decayed(
-            raised(params.train.lr_translation * scene_depth, pose_error[1]),
+            raised(params.train.lr_translation * scene_scale, pose_error[1]),
             final_pose,
         ),
         lr_pose_network: decayed(params.train.lr_pose_network, final_pose),
@@ -195,9 +192,21 @@ pub fn settings(
         noise: if_mcmc(lr_mean * params.mcmc.noise),
         sh_degree: params.train.sh_degree,
         sh_interval: params.train.sh_interval,
+        ssim_valid: params.train.ssim_padding == SsimPadding::Valid,
+        all_splats: params.mcmc.enabled && params.mcmc.all_splats,
         train_splats: true,
         pose: pose_step(params),
         ..StepSettings::default()
+    }
+}
+
+/// With `train.sh_interval_of: steps`, the highest band after so many steps of the run; every splat has it.
+pub fn admit_bands(settings: &mut StepSettings, params: &MapperParams, n_run: u64) {
+    let interval = u64::from(params.train.sh_interval);
+    if params.train.sh_interval_of == ShInterval::Steps && interval > 0 {
+        let highest = (n_run / interval).min(u64::from(params.train.sh_degree));
+        settings.sh_degree = highest as u8;
+        settings.sh_interval = 0;
     }
 }
 
@@ -225,6 +234,21 @@ fn pose_step(params: &MapperParams) -> PoseMode {
 mod tests {
     use super::*;
     use splat_engine::loss_weights::LossWeights;
+
+    #[test]
+    fn bands_come_by_steps_where_they_are_asked_to() {
+        let mut params = MapperParams::default();
+        params.train.sh_interval = 1000;
+        let at = |params: &MapperParams, n_run| {
+            let mut settings = settings(params, 1.0, [0.0; 2], End::Unknown, 0);
+            admit_bands(&mut settings, params, n_run);
+            (settings.sh_degree, settings.sh_interval)
+        };
+        assert_eq!(at(&params, 5000), (3, 1000), "by the updates of each splat");
+        params.train.sh_interval_of = ShInterval::Steps;
+        let degrees = [0, 999, 1000, 2999, 3000, 9000].map(|n| at(&params, n));
+        assert_eq!(degrees, [0, 0, 1, 2, 3, 3].map(|degree| (degree, 0)));
+    }
 
     #[test]
     fn a_round_visits_every_view_once() {

@@ -3,6 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use crate::mapper::params::{SceneScale, SeedShape};
 use crate::mapper::parts::Parts;
 use crate::mapper::train::convergence::Convergence;
 use crate::mapper::train::correspondences::SeenLandmarks;
@@ -10,7 +11,9 @@ use crate::mapper::train::densify;
 use crate::mapper::train::grow_prune;
 use crate::mapper::train::loss_curve::LossCurve;
 use crate::mapper::train::photometric::{self, FrameFit};
+use crate::mapper::train::scene_extent::scene_radius;
 use crate::mapper::train::schedule::{self, End, Schedule};
+use crate::mapper::train::seed_shape;
 use splat_engine::error::EngineError;
 use splat_engine::settings::StepSettings;
 use splat_engine::traits::Engine;
@@ -34,6 +37,8 @@ pub(crate) struct Trainer {
     convergence: Convergence,
     /// Index of the engine's view that frames are compared in, once one was.
     scratch_view: Option<usize>,
+    /// What rates of lengths are shares of, where that is the cameras' extent.
+    camera_radius: Option<f32>,
     /// Kept only where the epipolar loss has a use for matches.
     seen: SeenLandmarks,
 }
@@ -49,6 +54,7 @@ impl Trainer {
             curve: LossCurve::default(),
             convergence: Convergence::default(),
             scratch_view: None,
+            camera_radius: None,
             seen: SeenLandmarks::default(),
         }
     }
@@ -123,9 +129,12 @@ impl Trainer {
         let Some(view_ix) = self.schedule.next_view(&self.trainable) else {
             return Ok(None);
         };
-        let (scene_depth, pose_error) = (map.keyframes.scene_depth(), map.keyframes.pose_error());
+        let scene_depth = map.keyframes.scene_depth();
+        let scene_scale = self.camera_radius.unwrap_or(scene_depth);
+        let pose_error = map.keyframes.pose_error();
         let n_steps = self.schedule.steps_of(view_ix);
-        let mut settings = schedule::settings(map.params, scene_depth, pose_error, end, n_steps);
+        let mut settings = schedule::settings(map.params, scene_scale, pose_error, end, n_steps);
+        schedule::admit_bands(&mut settings, map.params, self.n_steps);
         settings.accumulate_screen_gradients =
             densify::accumulates(&map.params.densify, self.n_steps);
         map.engine.step(view_ix, &settings)?;
@@ -172,7 +181,9 @@ impl Trainer {
         if let Some(id) = id {
             grow_prune::mask_transients(map, id)?;
             let fills_gaps = self.schedule.may_fill(view_ix, end);
-            grow_prune::seed_from(map, &mut self.rng, id, fills_gaps)?;
+            if map.params.train.reseed_every > 0 {
+                grow_prune::seed_from(map, &mut self.rng, id, fills_gaps)?;
+            }
         }
         Ok(())
     }
@@ -201,6 +212,27 @@ impl Trainer {
 
     pub(crate) fn relocate(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
         grow_prune::relocate(map, self.trainable.len(), self.seed ^ self.n_steps)
+    }
+
+    /// After keyframes came or moved: what the scene's scale and the near plane are.
+    pub(crate) fn measure_scene(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        let train = &map.params.train;
+        let near = train.near;
+        self.camera_radius = match train.scene_scale {
+            SceneScale::MedianDepth => None,
+            SceneScale::Cameras => Some(scene_radius(map)?),
+        };
+        let scene_scale = self.camera_radius.unwrap_or(map.keyframes.scene_depth());
+        map.engine.set_near(near * scene_scale);
+        Ok(())
+    }
+
+    /// Splats that no step has moved get the size, opacity and rotation that are asked for.
+    pub(crate) fn reshape_fresh(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        match map.params.train.seed_shape {
+            SeedShape::Spacing => Ok(()),
+            SeedShape::Neighbours => seed_shape::reshape_fresh(map, &mut self.rng),
+        }
     }
 
     /// Clones, splits and removes splats, and resets opacities, where that is due.
