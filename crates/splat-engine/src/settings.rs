@@ -33,7 +33,7 @@ pub enum FirstEmbedding {
     /// Its place in the order of arrival, as waves: neighbours along the way move alike, as drift does.
     #[default]
     Order,
-    /// Nothing, as in 3R-GS: zeros. All cameras move alike until steps have told them apart.
+    /// Nothing, as in 3R-GS: zeros. All cameras move alike until steps part them.
     Zero,
 }
 

@@ -7,7 +7,7 @@ use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
 
-/// Splats closer than this to a camera are not drawn unless an engine is told of a farther plane, world units; the map's unit is about
+/// Splats closer than this to a camera are not drawn unless an engine is given a farther plane, world units; the map's unit is about
 /// the median scene depth.
 pub const NEAR: f32 = 0.01;
 

@@ -149,7 +149,7 @@ impl Mapper {
         let has_depth = |id: &&u32| self.keyframes.registered()[*id].depth.width_px > 0;
         let fresh: Vec<u32> = fresh.iter().filter(has_depth).copied().collect();
         let n = fresh.len() + deepened.len();
-        // Points are placed by now, and depth brings none beside them.
+        // The sparse points have become splats by now; depth brings none beside them.
         let per_keyframe = match self.params.train.start {
             Start::Depth => self.params.train.seeds_per_keyframe,
             Start::Points => 0,
