@@ -23,7 +23,7 @@ use crate::sfm::merge_submaps::merge;
 use crate::sfm::pairwise::{link_alike, link_anew, link_last, link_older, link_recent};
 use crate::sfm::params::SfmParams;
 use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView, Submap};
-use crate::sfm::register::{grow, grow_at_once, grow_clear};
+use crate::sfm::register::{grow, grow_at_once, release_clearer};
 use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
 use crate::sfm::updates::{self, Reported, SparseBatch, note};
 use splat_types::camera::Intrinsics;
@@ -413,7 +413,8 @@ impl Sfm {
     }
 
     fn place_waiting(&mut self, pool: &[usize], limits: &Limits, min_views: usize) {
-        grow_clear(&mut self.scene, pool, limits);
+        release_clearer(&mut self.scene);
+        grow(&mut self.scene, pool, limits);
         release_waiting(&mut self.scene);
         grow(&mut self.scene, pool, limits);
         while let Some(outcome) = self.try_start(pool, min_views, limits) {

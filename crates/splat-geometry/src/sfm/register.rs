@@ -8,17 +8,17 @@ use crate::pnp;
 use crate::sfm::adjust::{adjust_global, adjust_local};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
-use crate::sfm::pairwise::pair_seed;
+use crate::sfm::pairwise::{pair_seed, release};
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 
 /// Share of the candidate landmarks that must agree with a pose; and where there are fewer than `Limits::min_inliers` of them,
 /// down to half as many: an image of little texture has no more.
 const MIN_SHARE: f64 = 0.25;
 const MIN_SHARE_OF_FEW: f64 = 0.6;
-/// Candidate landmarks, in `Limits::min_inliers`, below which a view is compared with older ones before it is registered. A
-/// camera that comes back from elsewhere shares a few with the last keyframes, seen from far aside, and most with others: the
-/// few alone put it 5 % of the path off, at residuals of half a pixel.
+/// Candidate landmarks, in `Limits::min_inliers`, below which a view is compared with older ones before it is registered.
 const CLEAR: usize = 3;
+/// Matches of a held link that speak against registering a view by other links alone, in landmarks that those name.
+const CLEARER: usize = 2;
 /// Growth of a submap after which all its views are adjusted together.
 const GLOBAL_GROWTH: f64 = 1.3;
 /// Of fewer views that takes no longer than a few keyframes do, so that it is never left to another thread.
@@ -27,29 +27,31 @@ const MAX_SMALL: usize = 24;
 /// side) could slide or turn freely.
 const MIN_SPREAD: f64 = 0.03;
 
+/// Views that wait and match an old view far better than the last ones are registered by that, too. A camera that is back from
+/// elsewhere shares a few landmarks with the last keyframes, seen from far aside, and most with older ones: the few alone have
+/// put it 5 % of the path off, at residuals of half a pixel.
+pub(crate) fn release_clearer(scene: &mut Reconstruction) {
+    let is_clearer = |&(older, newer): &(usize, usize)| {
+        let is_next = scene.views[newer].registered.is_none() && scene.submap_of(older).is_some();
+        let n_landmarks = || best_submap(scene, newer).map_or(0, |(_, n)| n);
+        is_next && scene.held[&(older, newer)].matches.len() > CLEARER * n_landmarks()
+    };
+    let ends: Vec<(usize, usize)> = scene.held.keys().copied().filter(is_clearer).collect();
+    ends.into_iter().for_each(|e| release(scene, e));
+}
+
 /// Places as many of the waiting views of `pool` as can be registered, and adjusts about each.
 pub(crate) fn grow(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    grow_by(scene, pool, limits, limits.min_inliers / 2);
-}
-
-/// The same for views that share many landmarks with the submap.
-pub(crate) fn grow_clear(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    grow_by(scene, pool, limits, clear_pairs(limits));
-}
-
-fn clear_pairs(limits: &Limits) -> usize {
-    CLEAR * limits.min_inliers
-}
-
-fn grow_by(scene: &mut Reconstruction, pool: &[usize], limits: &Limits, min_pairs: usize) {
+    let min_pairs = limits.min_inliers / 2;
     while let Some(registered) = register_best(scene, pool, limits, min_pairs) {
         adjust_about(scene, &[registered], limits);
     }
 }
 
-/// As `grow_clear`, and sooner: the neighbourhood of the views is adjusted once, when all are registered.
+/// The same sooner, for views that share many landmarks with a submap: their neighbourhood is adjusted once, when all are
+/// registered.
 pub(crate) fn grow_at_once(scene: &mut Reconstruction, pool: &[usize], limits: &Limits) {
-    let min_pairs = clear_pairs(limits);
+    let min_pairs = CLEAR * limits.min_inliers;
     let registered: Vec<Registered> =
         std::iter::from_fn(|| register_best(scene, pool, limits, min_pairs)).collect();
     adjust_about(scene, &registered, limits);
