@@ -194,7 +194,10 @@ pub(crate) fn model(
             } else {
                 Scale::GIVEN
             };
-            let known = known.in_windows(&params.align, &params.sfm)?;
+            let mut known = known.in_windows(&params.align, &params.sfm)?;
+            if params.train.epipolar_weight > 0.0 {
+                known = known.with_matches(&params.sfm)?;
+            }
             Ok((Box::new(known), scale))
         }
         name => match name.strip_prefix("onnx:") {

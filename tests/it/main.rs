@@ -45,6 +45,7 @@ mod onnx;
 mod onnx_models;
 mod onnx_node;
 mod over_zenoh;
+mod pair_matches;
 mod photometric;
 mod point_start;
 mod pose_anchor;

@@ -8,7 +8,8 @@ use serde_json::Value;
 use crate::graphs::library;
 use crate::ground_truth::{batch, numbered};
 use crate::onnx_models::{Computing, description, foundation, open, saved, truthful};
-use splat_geometry::answer::View;
+use crate::pair_matches::check;
+use splat_geometry::answer::{PairMatches, View};
 use splat_geometry::model::GeometryModel as _;
 use splat_mapper::eval::trajectory::{TimedPose, read_tum};
 use splat_mapper::node::open_source;
@@ -150,6 +151,34 @@ fn windows_within_a_batch_are_joined_as_one_window_would_be() {
             );
         }
     }
+}
+
+#[test]
+fn a_model_reports_the_matches_of_its_windows() {
+    let Some(library) = library() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let frames: Vec<Frame> = demo().into_iter().step_by(8).take(10).collect();
+    let model = truthful(folder.path(), &frames);
+    let matches = |settings: &[&str]| {
+        let mut model = foundation(open(&library, &model).unwrap(), settings);
+        let numbered = numbered(&frames, false);
+        let mut found = model
+            .infer(&batch(0, 0, &numbered[..7]))
+            .unwrap()
+            .pair_matches;
+        found.extend(
+            model
+                .infer(&batch(1, 3, &numbered[4..]))
+                .unwrap()
+                .pair_matches,
+        );
+        found
+    };
+    let found = matches(&[]);
+    check(&found, &frames, "onnx");
+    let with_last = |pair: &&PairMatches| pair.keyframe_ids[1] == 9;
+    assert!(found.iter().any(|pair| with_last(&pair)));
+    assert!(matches(&["align.method=off"]).is_empty());
 }
 
 fn checked(library: &Path, model: &Path, more: &[&str]) -> Output {

@@ -23,6 +23,21 @@ pub(crate) struct Eye {
     pub(crate) cam_from_world: Rigid,
 }
 
+/// Symmetric epipolar distance of a match between two cameras, each its intrinsics and `cam_from_world`, in px; `None` near the epipole
+/// and without a baseline.
+pub fn distance_px(
+    own: &(Intrinsics, Rigid),
+    other: &(Intrinsics, Rigid),
+    own_px: [f32; 2],
+    other_px: [f32; 2],
+) -> Option<f64> {
+    let eye = |&(intrinsics, cam_from_world): &(Intrinsics, Rigid)| Eye {
+        intrinsics,
+        cam_from_world,
+    };
+    Some(one(&eye(own), &eye(other), own_px, other_px)?.0)
+}
+
 /// Weighted mean of the symmetric epipolar distance in px, and its gradient with respect to (rho, theta) of
 /// `exp([rho; theta]) * own.cam_from_world`. `other` answers with the camera of a view, `None` where there is none.
 pub(crate) fn epipolar(

@@ -120,7 +120,7 @@ pub mod view;
 
 pub mod random_start;
 
-pub(crate) mod epipolar;
+pub mod epipolar;
 
 pub mod traits;
 

@@ -96,6 +96,15 @@ pub struct SeenLandmark {
     pub depth: f32,
 }
 
+/// Pixels at which two keyframes saw the same points, verified by one rigid motion.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PairMatches {
+    /// In rising order.
+    pub keyframe_ids: [u32; 2],
+    /// In the image of the first and of the second keyframe, undistorted where its lens bends.
+    pub pixels: Vec<[[f32; 2]; 2]>,
+}
+
 /// What a model says of one batch. Keyframes that cannot be registered are absent, never guessed; a model that keeps
 /// state may deliver them with a later batch, and may revise poses it gave before.
 #[derive(Debug, Clone, Default)]
@@ -107,8 +116,10 @@ pub struct GeometryBatch {
     pub revised: Vec<PoseUpdate>,
     /// How far off the poses of `views` may be.
     pub pose_error: PoseStd,
-    /// Of models that match points; empty from others.
+    /// Of models that track points through many keyframes; empty from others.
     pub observations: Vec<Observations>,
+    /// Of models that match keyframes in pairs: those that were matched since the last batch.
+    pub pair_matches: Vec<PairMatches>,
     /// A place was seen again since: `revised` brings both ends of the way together.
     pub is_loop: bool,
     /// Why keyframes are missing, one plain sentence, for status and errors.

@@ -16,7 +16,7 @@ use crate::alignment::params::{AlignMethod, AlignParams};
 use crate::alignment::register_window::{self, Joined, Windows};
 use crate::alignment::tracks::{points, tracks};
 use crate::alignment::{depth_bundle, epipolar, rescale_depth};
-use crate::answer::{PoseUpdate, View};
+use crate::answer::{PairMatches, PoseUpdate, View};
 use crate::error::FeaturesError;
 use crate::sfm::params::SfmParams;
 use splat_types::image::RgbImage;
@@ -92,6 +92,11 @@ impl Aligner {
         joined.note = joined.note.or(lost).or_else(|| refined.note.clone());
         joined.refined = refined;
         joined
+    }
+
+    /// Verified matches of pairs of keyframes that were found since they were last taken; none with method off.
+    pub fn take_new_matches(&mut self) -> Vec<PairMatches> {
+        self.matcher.take_new_matches()
     }
 
     /// What all keyframes say together, once no more will come.

@@ -2,7 +2,7 @@
 //!
 //! Features and matches are remembered by keyframe, so that shared keyframes cost nothing twice.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::alignment::kept_views::KeptView;
 use crate::alignment::matched::{Matched, Pair, WindowView, depth_at};
 use crate::alignment::params::AlignParams;
-use crate::answer::View;
+use crate::answer::{PairMatches, View};
 use crate::error::FeaturesError;
 use crate::features::descriptor::{Features, working_image, working_size};
 use crate::features::extractor::FeatureExtractor;
@@ -42,6 +42,9 @@ const ERROR_SIDE_PX: f64 = 640.0;
 /// The focal length that verification rests on is the network's, so it is laxer than with a calibrated camera.
 const LAXITY: f64 = 1.5;
 
+/// Matches of one pair that are reported; an even choice of more.
+const MAX_REPORTED: usize = 64;
+
 /// Matches of features, by number.
 type Numbers = Vec<(u32, u32)>;
 
@@ -57,6 +60,8 @@ pub struct Matcher {
     held: BTreeMap<u32, StoredFeatures>,
     /// By keyframe ids in rising order; empty where two do not match.
     pairs: BTreeMap<(u32, u32), Numbers>,
+    /// Pairs that match and were not reported yet.
+    unreported: BTreeSet<(u32, u32)>,
 }
 
 #[derive(Debug)]
@@ -65,6 +70,19 @@ struct StoredFeatures {
     comparable: PreparedDescriptors,
     signature: PreparedDescriptors,
     size: (u32, u32),
+    /// Pixels of the keyframe's image to one of the working image, along either axis.
+    image_px: [f64; 2],
+}
+
+impl StoredFeatures {
+    /// Where a feature lies in the keyframe's image.
+    fn in_image(&self, feature: u32) -> [f32; 2] {
+        let px = self.features.pixels[feature as usize];
+        [
+            (px.x * self.image_px[0]) as f32,
+            (px.y * self.image_px[1]) as f32,
+        ]
+    }
 }
 
 impl Matcher {
@@ -79,6 +97,7 @@ impl Matcher {
             seed,
             held: BTreeMap::new(),
             pairs: BTreeMap::new(),
+            unreported: BTreeSet::new(),
         })
     }
 
@@ -142,8 +161,31 @@ impl Matcher {
     pub(crate) fn remember(&mut self, (older, newer): (u32, u32), kept: &KeptView, max: usize) {
         if let (Some(a), Some(b)) = (kept.get(&older), kept.get(&newer)) {
             let found = self.verified([&a.0, &b.0], max);
-            self.pairs.insert((older, newer), found);
+            self.keep_pair((older, newer), found);
         }
+    }
+
+    fn keep_pair(&mut self, ids: (u32, u32), found: Numbers) {
+        if !found.is_empty() {
+            self.unreported.insert(ids);
+        }
+        self.pairs.insert(ids, found);
+    }
+
+    /// Matches of pairs that were not taken before, at most 64 of each.
+    pub fn take_new_matches(&mut self) -> Vec<PairMatches> {
+        let fresh = std::mem::take(&mut self.unreported);
+        let of_pair = |ids: (u32, u32)| {
+            let (first, second) = (self.held.get(&ids.0)?, self.held.get(&ids.1)?);
+            let numbers = self.pairs.get(&ids)?;
+            let every = numbers.len().div_ceil(MAX_REPORTED).max(1);
+            let pixels = |&(i, j): &(u32, u32)| [first.in_image(i), second.in_image(j)];
+            Some(PairMatches {
+                keyframe_ids: [ids.0, ids.1],
+                pixels: numbers.iter().step_by(every).map(pixels).collect(),
+            })
+        };
+        fresh.into_iter().filter_map(of_pair).collect()
     }
 
     /// How many of the coarsest features of two keyframes match.
@@ -178,7 +220,9 @@ impl Matcher {
                 ((id(a), id(b)), found)
             })
             .collect();
-        self.pairs.extend(found);
+        for (ids, found) in found {
+            self.keep_pair(ids, found);
+        }
         let pair = |&(first, second): &(usize, usize)| {
             let found = self.pairs.get(&key(id(first), id(second)))?;
             let is_flipped = id(first) > id(second);
@@ -209,6 +253,10 @@ impl Matcher {
                 signature: PreparedDescriptors::new(&features.signature()),
                 features,
                 size: (rgb_image.width as u32, rgb_image.height as u32),
+                image_px: [
+                    image.width_px as f64 / rgb_image.width as f64,
+                    image.height_px as f64 / rgb_image.height as f64,
+                ],
             };
             (*id, held)
         };
@@ -222,6 +270,8 @@ impl Matcher {
             let Some(oldest) = oldest else { break };
             self.held.remove(&oldest);
             self.pairs.retain(|(a, b), _| *a != oldest && *b != oldest);
+            self.unreported
+                .retain(|(a, b)| *a != oldest && *b != oldest);
         }
     }
 

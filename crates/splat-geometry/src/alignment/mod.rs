@@ -37,3 +37,5 @@ pub mod register_window;
 pub mod epipolar;
 
 pub mod aligner;
+
+pub mod pair_matcher;

@@ -259,6 +259,7 @@ impl GeometryModel for FoundationModel {
         Ok(GeometryBatch {
             batch_id: batch.id,
             pose_error: self.pose_error(&out.views),
+            pair_matches: self.aligner.take_new_matches(),
             note: self.losses.note(),
             ..out
         })
@@ -267,6 +268,7 @@ impl GeometryModel for FoundationModel {
     fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
         Ok(GeometryBatch {
             revised: self.aligner.finish(),
+            pair_matches: self.aligner.take_new_matches(),
             note: self.losses.note(),
             ..GeometryBatch::default()
         })

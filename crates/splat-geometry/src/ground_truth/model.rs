@@ -13,6 +13,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
 use crate::alignment::aligner::Aligner;
+use crate::alignment::pair_matcher::PairMatcher;
 use crate::alignment::params::AlignParams;
 use crate::answer::{GeometryBatch, PoseQuality, PoseStd, View};
 use crate::error::GeometryError;
@@ -45,6 +46,8 @@ pub struct GroundTruthModel {
     disturbed: BTreeMap<u32, (Rigid, Pcg64Mcg)>,
     /// With `ground_truth.windows`: what a foundation model's answers go through.
     aligner: Option<Aligner>,
+    /// Without windows, where matches are wanted.
+    pairs: Option<PairMatcher>,
 }
 
 impl GroundTruthModel {
@@ -70,6 +73,7 @@ impl GroundTruthModel {
             stereo: KnownPoseStereo::new(sfm, mvs, seed)?,
             disturbed: BTreeMap::new(),
             aligner: None,
+            pairs: None,
         })
     }
 
@@ -82,6 +86,14 @@ impl GroundTruthModel {
     ) -> Result<Self, GeometryError> {
         if self.params.windows {
             self.aligner = Some(Aligner::new(align, sfm, self.seed)?);
+        }
+        Ok(self)
+    }
+
+    /// Reports matches between keyframes too, by features of their images. Windows report theirs in any case.
+    pub fn with_matches(mut self, sfm: &SfmParams) -> Result<Self, GeometryError> {
+        if !self.params.windows {
+            self.pairs = Some(PairMatcher::new(sfm, self.seed)?);
         }
         Ok(self)
     }
@@ -105,6 +117,7 @@ impl GroundTruthModel {
             batch_id: batch.id,
             views: joined.views,
             revised: joined.revised,
+            pair_matches: aligner.take_new_matches(),
             is_loop: joined.is_loop,
             note: joined.note,
             ..GeometryBatch::default()
@@ -216,6 +229,30 @@ impl GeometryModel for GroundTruthModel {
         if self.aligner.is_some() {
             return self.infer_window(batch);
         }
+        let mut answer = self.infer_batch(batch)?;
+        if let Some(pairs) = &mut self.pairs {
+            answer.pair_matches = pairs.matches(&answer.views, batch);
+        }
+        Ok(answer)
+    }
+
+    fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
+        if let Some(aligner) = &mut self.aligner {
+            return Ok(GeometryBatch {
+                revised: aligner.finish(),
+                pair_matches: aligner.take_new_matches(),
+                ..GeometryBatch::default()
+            });
+        }
+        let mut answer = self.stereo.finish();
+        answer.views = answer.views.into_iter().map(|v| self.disturb(v)).collect();
+        answer.pose_error = self.pose_error(&answer.views);
+        Ok(answer)
+    }
+}
+
+impl GroundTruthModel {
+    fn infer_batch(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let ready = self.views_without_stereo(batch)?;
         if ready.len() == batch.keyframes.len() {
             return Ok(GeometryBatch {
@@ -231,19 +268,6 @@ impl GeometryModel for GroundTruthModel {
             .retain(|view| ready.iter().all(|w| w.keyframe_id != view.keyframe_id));
         let by_stereo = answer.views.into_iter().map(|view| self.disturb(view));
         answer.views = by_stereo.chain(ready).collect();
-        answer.pose_error = self.pose_error(&answer.views);
-        Ok(answer)
-    }
-
-    fn finish(&mut self) -> Result<GeometryBatch, GeometryError> {
-        if let Some(aligner) = &mut self.aligner {
-            return Ok(GeometryBatch {
-                revised: aligner.finish(),
-                ..GeometryBatch::default()
-            });
-        }
-        let mut answer = self.stereo.finish();
-        answer.views = answer.views.into_iter().map(|v| self.disturb(v)).collect();
         answer.pose_error = self.pose_error(&answer.views);
         Ok(answer)
     }

@@ -157,7 +157,7 @@ impl Mapper {
         let joined = self.register(update.joined, PoseStd::default(), &geometry.observations)?;
         self.seed(&joined, &geometry.observations)?;
         let (parts, trainer) = self.split();
-        trainer.record_observations(&parts, &geometry.observations);
+        trainer.record_matches(&parts, geometry);
         let mut own = self.submaps.sort(&geometry.views, &self.keyframes);
         own.extend(if self.submaps.prior().is_some() {
             self.register_resumed()?

@@ -129,6 +129,12 @@ pub struct TrainParams {
     /// Weight of the epipolar distance in px over the correspondences of a view (3R-GS); 0 = off.
     #[schemars(range(min = 0.0, max = 100.0))]
     pub epipolar_weight: f32,
+    /// Weights of the correspondences: all equal; or adaptive, by how many of all are about as far off as each, none beyond 20 px of an
+    /// image of 518 (VGGT-X, 3R-GS).
+    pub epipolar_weighting: EpipolarWeighting,
+    /// Steps of the run after which the epipolar loss ends; 0 = never.
+    #[schemars(range(min = 0, max = 10000000))]
+    pub epipolar_until: u64,
     /// Share of an image's pixels that surely are static; worse ones in clusters lose their weight (RobustNeRF);
     /// 1 = off.
     #[schemars(range(min = 0.0, max = 1.0))]
@@ -213,6 +219,8 @@ impl Default for TrainParams {
             refine_until: 0.6,
             seed_shape: SeedShape::Spacing,
             epipolar_weight: 0.0,
+            epipolar_weighting: EpipolarWeighting::Adaptive,
+            epipolar_until: 3000,
             robust_inlier_fraction: 1.0,
             lr_mean: 0.0012,
             half_mean_updates: 30,
@@ -390,6 +398,16 @@ pub enum SsimPadding {
     Zero,
     /// Nothing: only windows that lie in the image are averaged (gsplat).
     Valid,
+}
+
+/// Weights of the matches of the epipolar loss.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum EpipolarWeighting {
+    /// By how many of all matches are about as far off (VGGT-X, 3R-GS).
+    Adaptive,
+    /// The same for all.
+    Equal,
 }
 
 /// The length that rates are shares of.

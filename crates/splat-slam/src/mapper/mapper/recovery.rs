@@ -116,7 +116,7 @@ impl Mapper {
         self.keyframes.restore(&KeyframeStore::default());
         self.submaps.forget_all();
         self.splats.restore_from(&[], &BTreeMap::new());
-        self.trainer.forget_landmarks();
+        self.trainer.forget_matches();
         self.trainer.set_trainable(Vec::new());
         self.trainer.reset_convergence();
     }

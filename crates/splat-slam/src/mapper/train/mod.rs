@@ -4,6 +4,8 @@ mod loss_curve;
 
 pub mod schedule;
 
+mod match_weights;
+
 mod correspondences;
 
 pub(crate) mod held_out;

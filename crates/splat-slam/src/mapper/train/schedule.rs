@@ -4,7 +4,9 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::mapper::params::{DepthLoss, MapperParams, PoseOptimization, ShInterval, SsimPadding};
+use crate::mapper::params::{
+    DepthLoss, MapperParams, PoseOptimization, ShInterval, SsimPadding, TrainParams,
+};
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
 /// Steps that every view gets soon, the newest first: what was seen is to be shown. While some lack them they take so large a
@@ -188,7 +190,6 @@ pub fn settings(
             DepthLoss::PaperCode => DepthMode::PaperCode,
             DepthLoss::PaperAlpha => DepthMode::PaperAlpha,
         },
-        epipolar_weight: params.train.epipolar_weight,
         noise: if_mcmc(lr_mean * params.mcmc.noise),
         sh_degree: params.train.sh_degree,
         sh_interval: params.train.sh_interval,
@@ -198,6 +199,12 @@ pub fn settings(
         pose: pose_step(params),
         ..StepSettings::default()
     }
+}
+
+/// Weight of the epipolar loss after so many steps of the run.
+pub fn epipolar_weight(train: &TrainParams, n_run: u64) -> f32 {
+    let is_over = train.epipolar_until > 0 && n_run >= train.epipolar_until;
+    if is_over { 0.0 } else { train.epipolar_weight }
 }
 
 /// With `train.sh_interval_of: steps`, the highest band after so many steps of the run; every splat has it.
@@ -248,6 +255,18 @@ mod tests {
         params.train.sh_interval_of = ShInterval::Steps;
         let degrees = [0, 999, 1000, 2999, 3000, 9000].map(|n| at(&params, n));
         assert_eq!(degrees, [0, 0, 1, 2, 3, 3].map(|degree| (degree, 0)));
+    }
+
+    #[test]
+    fn the_epipolar_loss_ends_where_it_is_asked_to() {
+        let mut train = TrainParams {
+            epipolar_weight: 2.0,
+            ..TrainParams::default()
+        };
+        let at = |train: &TrainParams| [0, 2999, 3000].map(|n| epipolar_weight(train, n));
+        assert_eq!(at(&train), [2.0, 2.0, 0.0], "as in 3R-GS");
+        train.epipolar_until = 0;
+        assert_eq!(at(&train), [2.0; 3], "never");
     }
 
     #[test]

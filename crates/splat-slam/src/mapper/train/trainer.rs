@@ -6,7 +6,7 @@ use rand_pcg::Pcg64Mcg;
 use crate::mapper::params::{SceneScale, SeedShape};
 use crate::mapper::parts::Parts;
 use crate::mapper::train::convergence::Convergence;
-use crate::mapper::train::correspondences::SeenLandmarks;
+use crate::mapper::train::correspondences::KnownMatches;
 use crate::mapper::train::densify;
 use crate::mapper::train::grow_prune;
 use crate::mapper::train::loss_curve::LossCurve;
@@ -17,7 +17,7 @@ use crate::mapper::train::seed_shape;
 use splat_engine::error::EngineError;
 use splat_engine::settings::StepSettings;
 use splat_engine::traits::Engine;
-use splat_geometry::answer::Observations;
+use splat_geometry::answer::GeometryBatch;
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
@@ -40,7 +40,8 @@ pub(crate) struct Trainer {
     /// What rates of lengths are shares of, where that is the cameras' extent.
     camera_radius: Option<f32>,
     /// Kept only where the epipolar loss has a use for matches.
-    seen: SeenLandmarks,
+    matches: KnownMatches,
+    warned_of_no_matches: bool,
 }
 
 impl Trainer {
@@ -55,7 +56,8 @@ impl Trainer {
             convergence: Convergence::default(),
             scratch_view: None,
             camera_radius: None,
-            seen: SeenLandmarks::default(),
+            matches: KnownMatches::default(),
+            warned_of_no_matches: false,
         }
     }
 
@@ -105,19 +107,36 @@ impl Trainer {
         self.scratch_view = None;
     }
 
-    pub(crate) fn forget_landmarks(&mut self) {
-        self.seen = SeenLandmarks::default();
+    pub(crate) fn forget_matches(&mut self) {
+        self.matches = KnownMatches::default();
     }
 
-    /// Gives every view its matches with all others, with what was seen since.
-    pub(crate) fn record_observations(&mut self, map: &Parts<'_>, observations: &[Observations]) {
+    pub(crate) fn record_matches(&mut self, map: &Parts<'_>, geometry: &GeometryBatch) {
         if map.params.train.epipolar_weight > 0.0 {
-            self.seen.record(observations);
+            self.matches.record(geometry);
         }
     }
 
-    pub(crate) fn match_views(&self, map: &mut Parts<'_>) -> Result<(), EngineError> {
-        self.seen.match_views(map.keyframes, map.engine)
+    /// Gives every view its matches with all others, with what was seen since, while the epipolar loss has a use for them.
+    pub(crate) fn match_views(&mut self, map: &mut Parts<'_>) -> Result<(), EngineError> {
+        let train = &map.params.train;
+        let weight = schedule::epipolar_weight(train, self.n_steps);
+        if weight <= 0.0 {
+            return Ok(());
+        }
+        let (keyframes, engine) = (&*map.keyframes, &mut *map.engine);
+        let n = self
+            .matches
+            .match_views(keyframes, engine, train.epipolar_weighting)?;
+        if n == 0 && self.trainable.len() > 1 && !self.warned_of_no_matches {
+            self.warned_of_no_matches = true;
+            tracing::warn!(
+                "train.epipolar_weight is {weight}, but the geometry has no matches between the {} keyframes so far, so that the \
+                 epipolar loss does nothing; a foundation model has some where align.method is not off and images overlap",
+                self.trainable.len()
+            );
+        }
+        Ok(())
     }
 
     /// One update of the optimiser; `None`: there is nothing to train on. Returns its settings.
@@ -135,6 +154,7 @@ impl Trainer {
         let n_steps = self.schedule.steps_of(view_ix);
         let mut settings = schedule::settings(map.params, scene_scale, pose_error, end, n_steps);
         schedule::admit_bands(&mut settings, map.params, self.n_steps);
+        settings.epipolar_weight = schedule::epipolar_weight(&map.params.train, self.n_steps);
         settings.accumulate_screen_gradients =
             densify::accumulates(&map.params.densify, self.n_steps);
         map.engine.step(view_ix, &settings)?;
