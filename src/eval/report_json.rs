@@ -42,6 +42,9 @@ pub struct Report {
     pub peak_rss_mib: Option<f64>,
     pub peak_gpu_mib: Option<f64>,
     pub quality: Quality,
+    /// At the steps that `eval.at_steps` names.
+    #[serde(default)]
+    pub quality_at: Vec<QualityAt>,
     #[serde(default)]
     pub budgets: Budgets,
     /// Null where the run began anew.
@@ -168,7 +171,15 @@ pub struct TrackingFigures {
 pub struct Quality {
     /// Every n-th keyframe was kept out of optimisation; 0 = none.
     pub holdout_every: u64,
+    /// Views that the figures are means of.
+    #[serde(default)]
+    pub views_holdout: u64,
+    #[serde(default)]
+    pub views_train: u64,
     pub psnr_train: Option<f64>,
+    pub ssim_train: Option<f64>,
+    /// By the network of `eval.lpips_model`; null without one.
+    pub lpips_train: Option<f64>,
     pub psnr_holdout: Option<f64>,
     pub ssim_holdout: Option<f64>,
     /// Of the right halves of held-out views, as rendered
@@ -179,6 +190,16 @@ pub struct Quality {
     pub ssim_holdout_exposed: Option<f64>,
     /// By the network of `eval.lpips_model`; null without one.
     pub lpips_holdout: Option<f64>,
+}
+
+/// Quality after some of the steps.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct QualityAt {
+    pub steps: u64,
+    /// Seconds since the run began, without those that measuring took.
+    pub wall_s: f64,
+    pub splats: u64,
+    pub quality: Quality,
 }
 
 /// How a run that goes on from a map stands to it.

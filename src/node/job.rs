@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 
+use crate::eval::report_json::QualityAt;
 use crate::machine::probe;
 use crate::node::engines::Engines;
 use crate::node::requests::RequestHandler;
@@ -124,6 +125,8 @@ pub struct Outcome {
     pub tracking: TrackingSummary,
     pub secs: StageSecs,
     pub latency: KeyframeLatency,
+    /// At the steps that `eval.at_steps` names.
+    pub quality_at: Vec<QualityAt>,
     /// Why keyframes are missing, in the geometry model's words.
     pub geometry_note: Option<String>,
     /// Times that the engine was lost.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::node::autosave::Autosave;
 use crate::node::backpressure::Backpressure;
 use crate::node::job::{Activity, KeyframeLatency, Progress};
+use crate::node::milestones::Milestones;
 use crate::node::publish_threads::Outgoing;
 use crate::node::recovery::Recovery;
 use crate::node::refinement::RefinementWorker;
@@ -93,6 +94,8 @@ pub(crate) struct MapFigures {
     unpublished: BTreeMap<u32, Stopwatch>,
     pub(crate) latency: KeyframeLatency,
     pub(crate) optimise_secs: f64,
+    /// Quality on the way.
+    pub(crate) milestones: Milestones,
 }
 
 impl MapFigures {
@@ -435,12 +438,25 @@ impl MapStage {
     /// Steps up to `target`, as long as nobody asks to stop; `end` of the steps made so far.
     fn make_steps(&mut self, target: u64, end: &dyn Fn(u64) -> End, publish: &mut Publish<'_>) {
         while self.map.n_steps() < target && !self.recovery.stop.is_asked() {
-            let n = STEPS_AT_ONCE.min(target - self.map.n_steps());
-            if !self.make_steps_at_once(n, end(self.map.n_steps())) {
+            let n_steps = self.map.n_steps();
+            let n = STEPS_AT_ONCE.min(self.figures.milestones.next(target) - n_steps);
+            if !self.make_steps_at_once(n, end(n_steps)) {
                 break;
             }
             self.snapshot_if_due(publish);
+            if self.figures.milestones.is_due(self.map.n_steps()) {
+                self.measure_milestone(publish);
+            }
         }
+    }
+
+    /// Quality as it is after these steps; no time of optimisation.
+    fn measure_milestone(&mut self, publish: &mut Publish<'_>) {
+        let since = Stopwatch::start();
+        self.refine_held_out(publish);
+        let measured = self.figures.milestones.measure(&mut self.map, &since);
+        self.react(measured);
+        self.figures.optimise_secs -= since.secs();
     }
 
     /// Also serves calls from outside. `false`: there is nothing to train on, or mapping has ended.

@@ -32,6 +32,10 @@ pub mod ros2;
 
 mod source_thread;
 
+mod quality;
+
+mod milestones;
+
 mod map_stage;
 
 mod open;

@@ -7,6 +7,7 @@ use anyhow::{anyhow, bail};
 use crate::node::autosave::Autosave;
 use crate::node::job::Job;
 use crate::node::map_stage::MapStage;
+use crate::node::milestones::Milestones;
 use crate::node::page_file::PageFile;
 use crate::node::recovery::Recovery;
 use crate::node::stop::ShutdownTimeout;
@@ -54,6 +55,7 @@ pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
         Recovery::new(params, job.is_live, job.engines.clone(), job.stop.clone()),
         job.output.as_mut(),
     );
+    map.figures.milestones = Milestones::of(params, job.is_live)?;
     map.autosave = Autosave::start(job.out.as_deref(), params.map.autosave_secs)?;
     if map.autosave.is_some() || job.output.is_some() {
         let (reported, landmarks) = queue("landmarks", 1, WhenFull::DropOldest);

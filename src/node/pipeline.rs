@@ -356,6 +356,7 @@ impl End {
             },
             tracking: self.tracking,
             latency: self.map.figures.latency,
+            quality_at: self.map.figures.milestones.behind,
             request_handler: self.map.request_handler.at_end(),
             map: self.map.map,
             geometry_note: self.geometry.note,

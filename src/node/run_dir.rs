@@ -13,10 +13,8 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt as log_format};
 
-use crate::eval::exposure_fit::{HalfScores, half_scores};
 use crate::eval::frames::{self, FrameRow, Source as Known};
-use crate::eval::image_metrics;
-use crate::eval::lpips::{Lpips, LpipsError};
+use crate::eval::lpips::Lpips;
 use crate::eval::report_json::{
     FrameCounts, KeyframeCounts, Latency, LoadShedding, Quality, Report, Resumed, SubmapEntry,
     Timing, TrackingFigures, percentile,
@@ -24,25 +22,16 @@ use crate::eval::report_json::{
 use crate::eval::trajectory::{TimedPose, write_tum};
 use crate::machine::memory::peak_rss_mib;
 use crate::node::job::{Activity, Outcome, Progress};
+use crate::node::quality::{MeasuredViews, measure_quality};
 use crate::node::save_map::{MapFile, SaveError, save_map};
 use crate::node::track_thread::TrackingSummary;
+use crate::params::params::Params;
 use crate::params::settings::{Settings, defaults};
 use crate::report::comparisons::Comparison;
 use crate::report::html::{ReportInputs, write_html};
 use crate::report::pose_quality::write_health;
-use splat_engine::error::EngineError;
 use splat_slam::mapper::mapper::reports::SubmapReport;
-use splat_types::image::RgbImage;
-use splat_types::rendering::Rendering;
 use splat_types::splats::layout::map_sha256;
-
-/// Training views whose quality is measured: enough for a mean, few enough for long recordings.
-const MAX_TRAIN_VIEWS: usize = 24;
-/// The same of each kind after a stop, which nobody wants to wait for.
-const MAX_VIEWS_STOPPED: usize = 6;
-/// Images in the report.
-const MAX_HELD_OUT_IMAGES: usize = 8;
-const MAX_TRAIN_IMAGES: usize = 4;
 
 /// Makes the directory and checks, before any work is done, that it can be written to.
 pub fn prepare(out: &Path) -> anyhow::Result<()> {
@@ -118,7 +107,7 @@ pub fn finish(
     let rows = frames::rows(&keyframes, tracks, &outcome.input.frame_stamps);
     let written = out.map_or(Ok(()), |out| write_map(outcome, (&keyframes, &rows), out));
     let (quality, comparisons) = match out {
-        Some(_) => measure_quality(outcome, params.map.holdout, lpips, on_progress),
+        Some(_) => quality_at_end(outcome, &params, lpips, on_progress),
         None => (Quality::default(), Vec::new()),
     };
     let report = Report {
@@ -288,6 +277,7 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
             n_bytes => Some(n_bytes as f64 / (1 << 20) as f64),
         },
         quality,
+        quality_at: outcome.quality_at.clone(),
         budgets: outcome.map.budgets(),
         resume_report: outcome.map.continuation().map(|c| Resumed {
             map_keyframes: c.keyframes as u64,
@@ -304,147 +294,33 @@ fn report(outcome: &Outcome, settings: &Settings, quality: Quality) -> Report {
     }
 }
 
-/// PSNR over held-out and some training views, and the images for the report.
-fn measure_quality(
+/// The figures and the images for the report; a fault of the engine leaves none.
+fn quality_at_end(
     outcome: &mut Outcome,
-    holdout_every: u32,
+    params: &Params,
     mut lpips: Option<Lpips>,
     on_progress: &mut dyn FnMut(Progress),
 ) -> (Quality, Vec<Comparison>) {
-    let (held_out, train) = measured_views(outcome);
-    let mut images = Vec::new();
-    let mut fault: Option<EngineError> = None;
-    let (mut done, of) = (0, held_out.len() + train.len());
-    let progress = outcome.progress();
-    let mut measure = |ids: &[u32], is_held_out: bool, max_images: usize| {
-        let image_stride = ids.len().div_ceil(max_images).max(1);
-        let (mut psnrs, mut held_out) = (Vec::new(), HeldOutScores::default());
-        for (i, id) in ids.iter().enumerate() {
-            if fault.is_some() {
-                break;
-            }
-            let activity = Activity::Quality { done, of };
-            on_progress(Progress {
-                activity,
-                ..progress
-            });
-            done += 1;
-            let shown = outcome.map.render_keyframe(*id);
-            let shown = shown.unwrap_or_else(|error| {
-                fault = Some(error);
-                None
-            });
-            let Some((rendering, photo)) = shown else {
-                continue;
-            };
-            let psnr = rendering.psnr(&photo);
-            psnrs.push(psnr);
-            if is_held_out {
-                held_out.add(&rendering, &photo, &mut lpips);
-            }
-            if i % image_stride == 0 {
-                images.push(Comparison {
-                    keyframe_id: *id,
-                    held_out: is_held_out,
-                    photo,
-                    rendering,
-                    psnr,
-                });
-            }
-        }
-        (mean(&psnrs), held_out)
+    let views = MeasuredViews {
+        holdout_every: params.map.holdout,
+        max_train: params.eval.train_views,
+        was_stopped: outcome.was_stopped,
     };
-    let (psnr_holdout, scores) = measure(&held_out, true, MAX_HELD_OUT_IMAGES);
-    let (psnr_train, _) = measure(&train, false, MAX_TRAIN_IMAGES);
-    if let Some(error) = fault {
+    let progress = outcome.progress();
+    let mut on_view = |done, of| {
+        let activity = Activity::Quality { done, of };
+        on_progress(Progress {
+            activity,
+            ..progress
+        });
+    };
+    let measured = measure_quality(&mut outcome.map, views, &mut lpips, &mut on_view);
+    measured.unwrap_or_else(|error| {
         tracing::error!("engine: {error}; quality is not measured");
         // Of a run that has failed before, the first reason counts.
         outcome.error.get_or_insert(format!("engine: {error}"));
-        return (Quality::default(), Vec::new());
-    }
-    let quality = Quality {
-        holdout_every: u64::from(holdout_every),
-        psnr_train,
-        psnr_holdout,
-        ssim_holdout: mean(&scores.ssims),
-        psnr_holdout_half: scores.half_mean(|half| half.psnr),
-        ssim_holdout_half: scores.half_mean(|half| half.ssim),
-        psnr_holdout_exposed: scores.half_mean(|half| half.psnr_exposed),
-        ssim_holdout_exposed: scores.half_mean(|half| half.ssim_exposed),
-        lpips_holdout: scores.lpips(),
-    };
-    (quality, images)
-}
-
-/// What is measured of held-out views beside PSNR.
-#[derive(Default)]
-struct HeldOutScores {
-    ssims: Vec<f64>,
-    halves: Vec<HalfScores>,
-    distances: Vec<f64>,
-}
-
-impl HeldOutScores {
-    fn add(&mut self, rendering: &Rendering, photo: &RgbImage, lpips: &mut Option<Lpips>) {
-        self.ssims.push(image_metrics::ssim(&rendering.rgb, photo));
-        self.halves.push(half_scores(rendering, photo));
-        self.distances.extend(lpips_of(lpips, rendering, photo));
-    }
-
-    fn half_mean(&self, score: impl Fn(&HalfScores) -> f64) -> Option<f64> {
-        mean(&self.halves.iter().map(score).collect::<Vec<f64>>())
-    }
-
-    /// A mean over some of the views would be another figure.
-    fn lpips(&self) -> Option<f64> {
-        mean(&self.distances).filter(|_| self.distances.len() == self.ssims.len())
-    }
-}
-
-/// Held-out views, and training views, that quality is measured by.
-fn measured_views(outcome: &Outcome) -> (Vec<u32>, Vec<u32>) {
-    let ids = outcome.map.keyframe_ids();
-    let (held_out, train): (Vec<u32>, Vec<u32>) = {
-        let (held_out, train): (Vec<_>, Vec<_>) =
-            ids.into_iter().partition(|(_, is_held_out)| *is_held_out);
-        (
-            held_out.into_iter().map(|k| k.0).collect(),
-            train.into_iter().map(|k| k.0).collect(),
-        )
-    };
-    let (most_held_out, most_train) = if outcome.was_stopped {
-        (MAX_VIEWS_STOPPED, MAX_VIEWS_STOPPED)
-    } else {
-        (usize::MAX, MAX_TRAIN_VIEWS)
-    };
-    let n_held_out = held_out.len();
-    let held_out = subsampled(held_out, most_held_out);
-    if held_out.len() < n_held_out {
-        let n = held_out.len();
-        tracing::info!("stopped: quality is that of {n} of {n_held_out} held-out views");
-    }
-    (held_out, subsampled(train, most_train))
-}
-
-/// Evenly, at most so many.
-fn subsampled(ids: Vec<u32>, most: usize) -> Vec<u32> {
-    let stride = ids.len().div_ceil(most).max(1);
-    ids.into_iter().step_by(stride).collect()
-}
-
-/// A network that fails is not asked again: the run is worth more than this figure.
-fn lpips_of(lpips: &mut Option<Lpips>, rendering: &Rendering, photo: &RgbImage) -> Option<f64> {
-    let distance = lpips.as_mut()?.distance(&rendering.rgb, photo);
-    let failed = |e: &LpipsError| tracing::warn!("quality.lpips_holdout stays null: {e}");
-    let distance = distance.inspect_err(failed).ok();
-    if distance.is_none() {
-        *lpips = None;
-    }
-    distance
-}
-
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        (Quality::default(), Vec::new())
+    })
 }
 
 /// Of this run: those of a saved map have stamps of another recording.

@@ -115,6 +115,7 @@ impl Params {
             train: self.train.clone(),
             mcmc: self.mcmc.clone(),
             densify: self.densify.clone(),
+            held_out: self.eval.held_out.clone(),
         }
     }
 }

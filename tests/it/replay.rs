@@ -101,6 +101,95 @@ fn a_replay_writes_a_whole_run_directory() {
 }
 
 #[test]
+fn quality_is_measured_on_the_way_where_it_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |name: &str, more: &[&str]| {
+        let few = [
+            "--geometry",
+            "ground_truth",
+            "--steps",
+            "60",
+            "--backend",
+            "cpu",
+        ];
+        let out = folder.path().join(name);
+        let output = replay(ROOM, &out, &[&few[..], more].concat());
+        (output.status.code(), last_line(&output), out)
+    };
+    let (code, line, out) = run(
+        "both",
+        &[
+            "--set",
+            "eval.at_steps=60,40",
+            "--set",
+            "eval.train_views=0",
+        ],
+    );
+    assert_eq!(code, Some(0), "{line}");
+    let report = report(&out);
+    let at = report["quality_at"].as_array().unwrap();
+    let steps: Vec<u64> = at.iter().map(|q| q["steps"].as_u64().unwrap()).collect();
+    assert_eq!(steps, [40, 60]);
+    let psnr = |quality: &Value| quality["psnr_holdout"].as_f64().unwrap();
+    assert!(psnr(&at[0]["quality"]) < psnr(&at[1]["quality"]) + 1.0);
+    // Poses of held-out views begin anew each time, and no step of training lies between.
+    assert!((psnr(&at[1]["quality"]) - psnr(&report["quality"])).abs() < 1e-6);
+    let count = |key: &str| report["quality"][key].as_u64().unwrap();
+    let registered = report["keyframes"]["registered"].as_u64().unwrap();
+    assert_eq!(count("views_train") + count("views_holdout"), registered);
+    assert!(report["quality"]["ssim_train"].as_f64().unwrap() > 0.3);
+    let seconds: Vec<f64> = at.iter().map(|q| q["wall_s"].as_f64().unwrap()).collect();
+    assert!(0.0 < seconds[0] && seconds[0] <= seconds[1], "{seconds:?}");
+
+    let (code, line, _) = run("bad", &["--set", "eval.at_steps=4k"]);
+    assert_ne!(code, Some(0));
+    assert!(
+        line.contains("eval.at_steps") && line.contains("4000,7000"),
+        "{line}"
+    );
+}
+
+#[test]
+fn held_out_poses_are_fitted_by_edges_where_that_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let psnr = |name: &str, more: &[&str]| {
+        let noise = [
+            "ground_truth.rotation_noise_deg=0.5",
+            "train.pose_opt=fixed",
+        ];
+        let noise = noise.iter().flat_map(|s| ["--set", s]);
+        let few = [
+            "--geometry",
+            "ground_truth",
+            "--steps",
+            "150",
+            "--backend",
+            "cpu",
+        ];
+        let more = more.iter().flat_map(|s| ["--set", s]);
+        let args: Vec<&str> = few.into_iter().chain(noise).chain(more).collect();
+        let out = folder.path().join(name);
+        let output = replay(ROOM, &out, &args);
+        assert!(output.status.success(), "{}", last_line(&output));
+        report(&out)["quality"]["psnr_holdout"].as_f64().unwrap()
+    };
+    let held = psnr("held", &["eval.pose_steps=0"]);
+    let whole = psnr("whole", &[]);
+    let edges = psnr(
+        "edges",
+        &[
+            "eval.pose_loss=masked_l1",
+            "eval.pose_steps=100",
+            "eval.pose_rate=0.0008",
+        ],
+    );
+    assert!(
+        whole > held + 0.3 && edges > held + 0.3,
+        "{held} {whole} {edges}"
+    );
+}
+
+#[test]
 fn threads_and_sequence_give_the_same_map_and_a_seed_another() {
     let run = |more: &[&str]| {
         let folder = tempfile::tempdir().unwrap();

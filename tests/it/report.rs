@@ -58,6 +58,7 @@ peak_gpu_mib
 peak_rss_mib
 quality.holdout_every
 quality.lpips_holdout
+quality.lpips_train
 quality.psnr_holdout
 quality.psnr_holdout_exposed
 quality.psnr_holdout_half
@@ -65,6 +66,10 @@ quality.psnr_train
 quality.ssim_holdout
 quality.ssim_holdout_exposed
 quality.ssim_holdout_half
+quality.ssim_train
+quality.views_holdout
+quality.views_train
+quality_at
 scale.metres_per_unit
 scale.source
 scale.std
@@ -136,7 +141,12 @@ pub(crate) fn sample_report() -> Report {
         },
         peak_rss_mib: Some(731.4),
         peak_gpu_mib: None,
+        quality_at: Vec::new(),
         quality: Quality {
+            views_holdout: 3,
+            views_train: 12,
+            ssim_train: Some(0.9),
+            lpips_train: None,
             holdout_every: 8,
             psnr_train: Some(26.31),
             psnr_holdout: Some(23.87),

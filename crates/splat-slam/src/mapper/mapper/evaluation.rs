@@ -32,8 +32,7 @@ impl Mapper {
             if !self.with_resident(id)? {
                 continue;
             }
-            let view_ix = self.keyframes.registered()[&id].view_ix;
-            refine_view(&mut self.split().0, view_ix)?;
+            refine_view(&mut self.split().0, id)?;
             if !was_here {
                 self.page_out(id)?;
             }

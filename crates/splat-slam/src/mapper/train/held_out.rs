@@ -1,30 +1,43 @@
 //! Views that were kept out of optimisation -> where their images fit best.
 
-use crate::mapper::params::MapperParams;
+use crate::mapper::params::{HeldOutLoss, MapperParams};
 use crate::mapper::parts::Parts;
 use crate::mapper::train::schedule::{self, End};
+use crate::mapper::train::strong_gradients;
 use splat_engine::error::EngineError;
 use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 
-/// Steps that refine the pose of one held-out view, and the share of the rate at the last. 3R-GS makes 100, to 1 %; half of
-/// them end within 0.03 dB.
-const STEPS: u32 = 50;
+/// Share of the rate at the last step (3R-GS).
 const FINAL_RATE: f32 = 0.01;
-/// First rate, radians and share of the scene's depth: in all, a pose can move by 11 times as much.
-const RATE: f32 = 3e-3;
 
-/// Moves one view, alone and with the splats frozen, to where its image fits best.
-pub(crate) fn refine_view(map: &mut Parts<'_>, view_ix: usize) -> Result<(), EngineError> {
-    for step in 0..STEPS {
-        let rate = RATE * FINAL_RATE.powf(step as f32 / STEPS as f32);
-        let settings = pose_only(
+/// Moves one view, alone and with the splats frozen, to where its image fits best (`eval.pose_*`).
+pub(crate) fn refine_view(map: &mut Parts<'_>, id: u32) -> Result<(), EngineError> {
+    let Some(registered) = map.keyframes.registered().get(&id) else {
+        return Ok(());
+    };
+    let view_ix = registered.view_ix;
+    let held_out = map.params.held_out.clone();
+    let is_masked = held_out.pose_loss == HeldOutLoss::MaskedL1;
+    if is_masked {
+        let mask = strong_gradients::mask(&registered.image);
+        map.engine.set_mask(view_ix, mask)?;
+    }
+    for step in 0..held_out.pose_steps {
+        let done = step as f32 / held_out.pose_steps as f32;
+        let mut settings = pose_only(
             map.params,
             map.keyframes.scene_depth(),
             map.keyframes.pose_error(),
-            rate,
+            held_out.pose_rate * FINAL_RATE.powf(done),
         );
+        if is_masked {
+            settings.ssim_weight = 0.0;
+        }
         map.engine.step(view_ix, &settings)?;
+    }
+    if is_masked {
+        map.engine.set_mask(view_ix, None)?;
     }
     Ok(())
 }

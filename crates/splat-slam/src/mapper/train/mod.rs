@@ -8,6 +8,8 @@ mod match_weights;
 
 mod correspondences;
 
+mod strong_gradients;
+
 pub(crate) mod held_out;
 
 pub mod photometric;
