@@ -96,6 +96,24 @@ tracking.work_ms_p50
 tracking.work_ms_p95
 version";
 
+fn sample_quality() -> Quality {
+    Quality {
+        views_holdout: 3,
+        views_train: 12,
+        ssim_train: Some(0.9),
+        lpips_train: None,
+        holdout_every: 8,
+        psnr_train: Some(26.31),
+        psnr_holdout: Some(23.87),
+        ssim_holdout: Some(0.791),
+        psnr_holdout_half: Some(23.52),
+        ssim_holdout_half: Some(0.783),
+        psnr_holdout_exposed: Some(24.06),
+        ssim_holdout_exposed: Some(0.786),
+        lpips_holdout: None,
+    }
+}
+
 pub(crate) fn sample_report() -> Report {
     let mut settings = Settings::shipped();
     settings.merge_setting("train.steps=1200").unwrap();
@@ -142,21 +160,7 @@ pub(crate) fn sample_report() -> Report {
         peak_rss_mib: Some(731.4),
         peak_gpu_mib: None,
         quality_at: Vec::new(),
-        quality: Quality {
-            views_holdout: 3,
-            views_train: 12,
-            ssim_train: Some(0.9),
-            lpips_train: None,
-            holdout_every: 8,
-            psnr_train: Some(26.31),
-            psnr_holdout: Some(23.87),
-            ssim_holdout: Some(0.791),
-            psnr_holdout_half: Some(23.52),
-            ssim_holdout_half: Some(0.783),
-            psnr_holdout_exposed: Some(24.06),
-            ssim_holdout_exposed: Some(0.786),
-            lpips_holdout: None,
-        },
+        quality: sample_quality(),
         budgets: Budgets {
             max_splats: 60_000,
             evicted_splats: 12,
