@@ -37,6 +37,8 @@ enum Command {
     Synth(SynthArgs),
     /// Compares the keyframes of a run with reference poses
     Eval(EvalArgs),
+    /// Maps one scene in several ways and prints a table: quality, poses, time and memory
+    Compare(CompareArgs),
     /// Renders a map from given poses
     Render(RenderArgs),
     /// Converts a map to another format
@@ -194,6 +196,55 @@ struct EvalArgs {
 }
 
 #[derive(Debug, Args)]
+struct CompareArgs {
+    /// MCAP file, rosbag2 folder, folder of images, COLMAP scene or transforms.json
+    scene: PathBuf,
+    /// Folder for the table and a run directory of each row; rows that are there already are kept
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// ours, fastsplatting, 3dgs (the scene's points), colmap_3dgs, 3dgs_mcmc, 3rgs; the first is what others are compared with at equal
+    /// time
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "ours,fastsplatting,colmap_3dgs,3dgs_mcmc,3rgs"
+    )]
+    rows: Vec<String>,
+    /// Steps of every row; schedules of the methods are shortened to them
+    #[arg(long, default_value_t = 1500)]
+    steps: u64,
+    /// Longer side of the images, pixels
+    #[arg(long, value_name = "PX", default_value_t = 320)]
+    max_side: u32,
+    /// Cap on splats
+    #[arg(long, default_value_t = 60_000)]
+    max_splats: usize,
+    /// Images drawn from a folder by the seed; 0 = all
+    #[arg(long, default_value_t = 0)]
+    images: usize,
+    /// Where ours and FastSplatting take poses and depth from: sfm or onnx:FILE
+    #[arg(long, default_value = "sfm")]
+    geometry: String,
+    /// auto, wgpu or cpu
+    #[arg(long, default_value = "auto")]
+    backend: String,
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Every N-th keyframe is held out
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    holdout: u32,
+    /// Poses to measure by, as eval takes them; else the scene's own
+    #[arg(long, value_name = "FILE_OR_SCENE")]
+    reference: Option<PathBuf>,
+    /// ONNX file of LPIPS (docs/FORMATS.md)
+    #[arg(long, value_name = "FILE", default_value = "")]
+    lpips: String,
+    /// Prints JSON instead of the table
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Args)]
 struct RenderArgs {
     /// map.splatmap or map.ply
     map: PathBuf,
@@ -255,6 +306,7 @@ pub fn main() -> ExitCode {
         Command::Record(args) => recording::run(&args),
         Command::Synth(args) => commands::synth(&args),
         Command::Eval(args) => commands::eval(&args),
+        Command::Compare(args) => commands::compare(&args),
         Command::Render(args) => commands::render(&args),
         Command::Export(args) => commands::export(&args),
         Command::Model(ModelCommand::Check(args)) => commands::model_check(&args),

@@ -15,4 +15,6 @@ pub mod params;
 
 pub mod node;
 
+pub mod compare;
+
 pub mod cli;

@@ -1,13 +1,17 @@
 //! `synth`, `eval`, `render`, `export`, `model`, `doctor`: arguments -> one call each.
 
+use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 
 use crate::cli::{
-    EvalArgs, ExportArgs, ModelCheckArgs, RenderArgs, SynthArgs, Usage, mapping, say,
+    CompareArgs, EvalArgs, ExportArgs, ModelCheckArgs, RenderArgs, SynthArgs, Usage, mapping, say,
 };
+use crate::compare::rows::{Row, Shared};
+use crate::compare::run::{self, Comparison};
+use crate::compare::table;
 use crate::doctor::check::State;
 use crate::doctor::checks;
 use crate::doctor::model_check::Report;
@@ -63,6 +67,45 @@ pub(crate) fn eval(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         say(evaluation);
     }
     Ok(ExitCode::SUCCESS)
+}
+
+pub(crate) fn compare(args: &CompareArgs) -> anyhow::Result<ExitCode> {
+    let row = |name: &String| {
+        let names = Row::ALL.map(Row::name).join(", ");
+        let unknown = || Usage(format!("--rows {name} is none of {names}"));
+        Row::by_name(name).ok_or_else(unknown)
+    };
+    let comparison = Comparison {
+        scene: args.scene.clone(),
+        out: args.out.clone(),
+        rows: args.rows.iter().map(row).collect::<Result<_, _>>()?,
+        shared: Shared {
+            steps: args.steps,
+            max_side: args.max_side,
+            max_splats: args.max_splats,
+            images: args.images,
+            geometry: args.geometry.clone(),
+            backend: args.backend.clone(),
+            seed: args.seed,
+            holdout: args.holdout,
+            lpips_model: args.lpips.clone(),
+        },
+        reference: args.reference.clone(),
+    };
+    let rows = run::run(&comparison, &mut |line| {
+        writeln!(std::io::stderr(), "{line}").ok();
+    })?;
+    if args.json {
+        say(serde_json::to_string_pretty(&rows)?);
+    } else {
+        say(table::markdown(&rows));
+    }
+    let has_failed = rows.iter().any(|row| row.error.is_some());
+    Ok(if has_failed {
+        ExitCode::FAILURE
+    } else {
+        ExitCode::SUCCESS
+    })
 }
 
 pub(crate) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {

@@ -198,6 +198,8 @@ pub struct QualityAt {
     pub steps: u64,
     /// Seconds since the run began, without those that measuring took.
     pub wall_s: f64,
+    /// Seconds that measuring has taken in all so far.
+    pub measured_s: f64,
     pub splats: u64,
     pub quality: Quality,
 }

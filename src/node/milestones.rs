@@ -90,6 +90,7 @@ impl Milestones {
         self.behind.push(QualityAt {
             steps,
             wall_s,
+            measured_s: self.spent_secs,
             splats: map.n_splats() as u64,
             quality,
         });
