@@ -195,6 +195,7 @@ struct EvalArgs {
     json: bool,
 }
 
+/// Many fields: one for each flag.
 #[derive(Debug, Args)]
 struct CompareArgs {
     /// MCAP file, rosbag2 folder, folder of images, COLMAP scene or transforms.json

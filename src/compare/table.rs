@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::eval::evaluation::Evaluation;
 use crate::eval::report_json::Report;
 
-/// One row; figures that there are not are null.
+/// One row; figures that there are not are null. Many fields: the keys of compare.json, and columns of the table.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RowFigures {
     /// As `--rows` names it, and for people.

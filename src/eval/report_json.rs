@@ -167,6 +167,7 @@ pub struct TrackingFigures {
     pub work_ms_p95: Option<f64>,
 }
 
+/// How like its images the map is. Many fields: the keys of `quality` in report.json.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quality {
     /// Every n-th keyframe was kept out of optimisation; 0 = none.

@@ -116,7 +116,7 @@ pub struct InputSummary {
     pub truth: Vec<(Stamp, Rigid)>,
 }
 
-/// What a run leaves behind.
+/// What a run leaves behind. Many fields: what each stage gathered.
 pub struct Outcome {
     pub snapshot: Arc<Snapshot>,
     pub map: Mapper,
