@@ -9,6 +9,10 @@ use serde::{Deserialize, Serialize};
 pub struct SelectParams {
     /// Every frame becomes a keyframe.
     pub every_frame: bool,
+    /// Every n-th frame that the source brings becomes a keyframe that is kept out of optimisation to measure
+    /// quality, besides map.holdout: runs that choose other keyframes are measured by the same images; 0 = off.
+    #[schemars(range(min = 0, max = 1000000))]
+    pub holdout_frames: u64,
     /// Median image motion that makes a keyframe, share of the longer side.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub min_flow: f64,
@@ -37,6 +41,7 @@ impl Default for SelectParams {
     fn default() -> Self {
         Self {
             every_frame: false,
+            holdout_frames: 0,
             min_flow: 0.08,
             min_parallax: 0.014,
             max_rate_hz: 10.0,

@@ -86,10 +86,16 @@ impl Selector {
     }
 
     /// Returns the frame as a keyframe when the map should keep it.
-    pub fn push(&mut self, frame: Frame) -> Option<Keyframe> {
-        if self.params.every_frame {
-            return Some(self.keep(frame));
-        }
+    pub fn push(&mut self, mut frame: Frame) -> Option<Keyframe> {
+        let every = self.params.holdout_frames;
+        frame.is_held_out |= every > 0 && frame.seq % every == every / 2;
+        // Held-out frames come besides: those that the map learns from stay nearly the same without them.
+        let is_kept = self.params.every_frame || self.shows_more(&frame) || frame.is_held_out;
+        is_kept.then(|| self.keep(frame))
+    }
+
+    /// Whether the frame shows enough that the last keyframe does not; it then takes that one's place.
+    fn shows_more(&mut self, frame: &Frame) -> bool {
         let grey = small_grey(&frame.image);
         let sharpness = sharpness(&grey);
         let is_sharp = self.is_sharp(sharpness);
@@ -98,7 +104,7 @@ impl Selector {
             // Stamps that go back are followed at once.
             let secs = stamp_secs - last.followed_secs;
             if (0.0..1.0 / MAX_FOLLOWED_HZ).contains(&secs) {
-                return None;
+                return false;
             }
             last.followed_secs = stamp_secs;
             let motion = last.follow(grey.clone());
@@ -113,12 +119,12 @@ impl Selector {
                     share >= 1.0 && (is_sharp || flow >= params.min_flow + params.max_blur_wait)
                 }
             };
-            if too_soon || !moved {
-                return None;
+            if too_soon || !moved || frame.is_held_out {
+                return false;
             }
         }
         self.last = Some(LastKeyframe::new(stamp_secs, grey));
-        Some(self.keep(frame))
+        true
     }
 
     fn keep(&mut self, frame: Frame) -> Keyframe {

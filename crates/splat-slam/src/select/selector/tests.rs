@@ -62,6 +62,34 @@ fn motion_of_min_flow_makes_a_keyframe() {
 }
 
 #[test]
+fn held_out_frames_come_besides_the_others() {
+    let frames = || (0..16).map(|i| frame(i, 8.0 * i as f64, 1.0));
+    let select = SelectParams {
+        holdout_frames: 6,
+        ..params()
+    };
+    assert_eq!(kept(frames(), params()), [0, 4, 8, 12]);
+    assert_eq!(kept(frames(), select.clone()), [0, 3, 4, 8, 9, 12, 15]);
+    let mut selector = Selector::new(select);
+    let held_out: Vec<u64> = frames()
+        .filter_map(|f| selector.push(f))
+        .filter(|k| k.frame.is_held_out)
+        .map(|k| k.frame.seq)
+        .collect();
+    assert_eq!(held_out, [3, 9, 15]);
+}
+
+#[test]
+fn a_held_out_frame_leaves_its_turn_to_the_next() {
+    let select = SelectParams {
+        holdout_frames: 8,
+        ..params()
+    };
+    let frames = (0..12).map(|i| frame(i, 8.0 * i as f64, 1.0));
+    assert_eq!(kept(frames, select), [0, 4, 5, 9]);
+}
+
+#[test]
 fn a_blank_wall_makes_no_keyframes() {
     assert_eq!(
         kept((0..10).map(|i| frame(i, 10.0 * i as f64, 0.0)), params()),
