@@ -231,7 +231,7 @@ struct CompareArgs {
     backend: String,
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Every N-th keyframe is held out
+    /// Every N-th image of the scene is held out: the same images in all rows
     #[arg(long, value_name = "N", default_value_t = 10)]
     holdout: u32,
     /// Poses to measure by, as eval takes them; else the scene's own

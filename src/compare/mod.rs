@@ -4,4 +4,6 @@ pub mod rows;
 
 pub mod table;
 
+pub mod colmap;
+
 pub mod run;

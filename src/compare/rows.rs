@@ -95,7 +95,8 @@ impl Row {
         add("--steps", &shared.steps.to_string());
         add("--max-side", &shared.max_side.to_string());
         add("--seed", &shared.seed.to_string());
-        add("--holdout", &shared.holdout.to_string());
+        // Counted by the source's frames instead of by keyframes, which each row chooses for itself.
+        add("--holdout", "0");
         for setting in self.settings(shared) {
             add("--set", &setting);
         }
@@ -105,8 +106,14 @@ impl Row {
     fn settings(self, shared: &Shared) -> Vec<String> {
         let quarter = (shared.steps / 4).max(1);
         let at = [1, 2, 3].map(|k| (k * quarter).to_string()).join(",");
+        // COLMAP's scene holds the drawn images, and perhaps not all of them: their names say which are held out.
+        let (images, holdout) = match self {
+            Self::ColmapGaussian3d => (0, 0),
+            _ => (shared.images, shared.holdout),
+        };
         let mut all = vec![
-            format!("source.subsample={}", shared.images),
+            format!("source.subsample={images}"),
+            format!("select.holdout_frames={holdout}"),
             format!("train.max_side={}", shared.max_side),
             format!("map.max_splats={}", shared.max_splats),
             format!("eval.at_steps={at}"),

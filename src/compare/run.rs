@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 
+use crate::compare::colmap::{colmap, last_line};
 use crate::compare::rows::{Row, Shared};
 use crate::compare::table::{RowFigures, at_equal_time, markdown};
 use crate::eval::error::write_atomically;
@@ -66,9 +67,19 @@ fn write(out: &Path, rows: &[RowFigures]) -> anyhow::Result<()> {
 
 fn one(comparison: &Comparison, row: Row, say: &mut dyn FnMut(&str)) -> anyhow::Result<RowFigures> {
     let folder = comparison.out.join(row.name());
+    let shared = &comparison.shared;
     let (mut scene, mut secs_before) = (comparison.scene.clone(), 0.0);
+    let mut arguments = row.arguments(shared);
     if row == Row::ColmapGaussian3d {
-        (scene, secs_before) = colmap(&comparison.scene, &comparison.out.join("colmap"), say)?;
+        let work = comparison.out.join("colmap");
+        let of_images = (shared.images, shared.seed, shared.holdout);
+        let made = colmap(&scene, &work, of_images, say)?;
+        (scene, secs_before) = (made.folder, made.secs);
+        let held_out = made.held_out.join(",");
+        arguments.extend([
+            "--set".to_owned(),
+            format!("source.holdout_prefixes={held_out}"),
+        ]);
     }
     let has_layout = Layout::find(&scene).is_some();
     if row.needs_points() && !has_layout {
@@ -76,7 +87,6 @@ fn one(comparison: &Comparison, row: Row, say: &mut dyn FnMut(&str)) -> anyhow::
             "the scene brings no sparse points: a COLMAP or nerfstudio scene does; colmap_3dgs makes them by COLMAP"
         );
     }
-    let arguments = row.arguments(&comparison.shared);
     let record = folder.join("compare_arguments.json");
     let wanted = serde_json::to_string(&(&scene, &arguments))?;
     let is_there = fs::read_to_string(&record).is_ok_and(|found| found == wanted)
@@ -134,110 +144,4 @@ fn replay(scene: &Path, folder: &Path, arguments: &[String]) -> anyhow::Result<(
         bail!("{}", last_line(&folder.join("compare.log")));
     }
     Ok(())
-}
-
-/// Poses and points of the images by COLMAP, with the seconds that took: (scene, seconds). Kept from an earlier comparison.
-fn colmap(scene: &Path, work: &Path, say: &mut dyn FnMut(&str)) -> anyhow::Result<(PathBuf, f64)> {
-    let images = scene.join("images");
-    if !images.is_dir() {
-        bail!(
-            "COLMAP needs a folder of images: {} is none",
-            images.display()
-        );
-    }
-    let done = work.join("seconds.txt");
-    if let Some(secs) = fs::read_to_string(&done)
-        .ok()
-        .and_then(|t| t.trim().parse().ok())
-    {
-        return Ok((work.to_owned(), secs));
-    }
-    let watch = Stopwatch::start();
-    fs::create_dir_all(work.join("sparse"))?;
-    let link = work.join("images");
-    link_images(&images, &link)?;
-    let database = work.join("database.db");
-    // What an interrupted try left is no start.
-    fs::remove_file(&database).ok();
-    let path = |path: &Path| path.display().to_string();
-    let (database, images, sparse) = (path(&database), path(&link), path(&work.join("sparse")));
-    let stages: [&[&str]; 3] = [
-        &[
-            "feature_extractor",
-            "--database_path",
-            &database,
-            "--image_path",
-            &images,
-            "--ImageReader.single_camera",
-            "1",
-            "--SiftExtraction.use_gpu",
-            "0",
-        ],
-        &[
-            "exhaustive_matcher",
-            "--database_path",
-            &database,
-            "--SiftMatching.use_gpu",
-            "0",
-        ],
-        &[
-            "mapper",
-            "--database_path",
-            &database,
-            "--image_path",
-            &images,
-            "--output_path",
-            &sparse,
-        ],
-    ];
-    for stage in stages {
-        say(&format!("colmap {}", stage[0]));
-        let log = work.join(format!("{}.log", stage[0]));
-        let file = fs::File::create(&log)?;
-        let status = Command::new("colmap")
-            .args(stage)
-            .env("QT_QPA_PLATFORM", "offscreen")
-            .stdin(Stdio::null())
-            .stdout(file.try_clone()?)
-            .stderr(file)
-            .status()
-            .context("colmap cannot be started; install it (apt install colmap) or leave the row colmap_3dgs out")?;
-        if !status.success() {
-            bail!("colmap {}: {}", stage[0], last_line(&log));
-        }
-    }
-    if !work.join("sparse/0").is_dir() {
-        bail!(
-            "COLMAP found no model of these images: {}",
-            work.join("mapper.log").display()
-        );
-    }
-    let secs = watch.secs();
-    write_atomically("the time of COLMAP", format!("{secs}\n").as_bytes(), &done)?;
-    Ok((work.to_owned(), secs))
-}
-
-/// The files of a folder again in another one, without a copy where the disk can do that.
-fn link_images(from: &Path, to: &Path) -> anyhow::Result<()> {
-    fs::create_dir_all(to)?;
-    for entry in fs::read_dir(from)? {
-        let entry = entry?;
-        let there = to.join(entry.file_name());
-        if !entry.path().is_file() || there.exists() {
-            continue;
-        }
-        if fs::hard_link(entry.path(), &there).is_err() {
-            fs::copy(entry.path(), &there)?;
-        }
-    }
-    Ok(())
-}
-
-fn last_line(log: &Path) -> String {
-    let text = fs::read_to_string(log).unwrap_or_default();
-    let line = text.lines().rev().find(|line| !line.trim().is_empty());
-    line.map_or_else(
-        || format!("it ended without a word: {}", log.display()),
-        ToOwned::to_owned,
-    )
 }

@@ -20,6 +20,9 @@ pub struct RowFigures {
     pub peak_rss_mib: Option<f64>,
     pub peak_gpu_mib: Option<f64>,
     pub keyframes: u64,
+    /// Images that are held out, which val figures are of; the same in each row that registers them.
+    #[serde(default)]
+    pub views_holdout: u64,
     pub splats: u64,
     pub steps: u64,
     pub psnr_train: Option<f64>,
@@ -61,6 +64,7 @@ impl RowFigures {
             peak_rss_mib: report.peak_rss_mib,
             peak_gpu_mib: report.peak_gpu_mib,
             keyframes: report.keyframes.registered,
+            views_holdout: quality.views_holdout,
             splats: report.splats,
             steps: report.steps,
             psnr_train: quality.psnr_train,
@@ -113,8 +117,8 @@ fn value_at(curve: &[(f64, f64)], x: f64) -> Option<f64> {
 /// A table that Markdown readers show, with what each column is below.
 pub fn markdown(rows: &[RowFigures]) -> String {
     let mut text = String::from(
-        "| row | val PSNR | val SSIM | val LPIPS | at equal time | train PSNR | train SSIM | train LPIPS | ATE % | rotation deg | time s | memory MiB | keyframes | splats |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| row | val PSNR | val SSIM | val LPIPS | at equal time | train PSNR | train SSIM | train LPIPS | ATE % | rotation deg | time s | memory MiB | keyframes | val images | splats |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
         if let Some(error) = &row.error {
@@ -123,7 +127,7 @@ pub fn markdown(rows: &[RowFigures]) -> String {
                 "| {} | {} |{}",
                 row.title,
                 one_line(error),
-                " |".repeat(12)
+                " |".repeat(13)
             )
             .ok();
             continue;
@@ -146,12 +150,13 @@ pub fn markdown(rows: &[RowFigures]) -> String {
             figure(row.time_s, 0),
             figure(memory, 0),
             row.keyframes.to_string(),
+            row.views_holdout.to_string(),
             row.splats.to_string(),
         ];
         writeln!(text, "| {} |", cells.join(" | ")).ok();
     }
     text.push_str(
-        "\nPSNR in dB; val: held-out views, each pose refined alone first; at equal time: val PSNR when the first row ended; ATE: of the extent, \
+        "\nPSNR in dB; val: held-out views, every n-th image of the scene and so the same in all rows that registered them (val images), each pose refined alone first; at equal time: val PSNR when the first row ended; ATE: of the extent, \
          after Sim(3) alignment to the scene's poses; memory: of the GPU where there is one, else of the process.\n",
     );
     text
@@ -195,7 +200,7 @@ mod tests {
         let text = markdown(&rows);
         let lines: Vec<&str> = text.lines().take(7).collect();
         let n_bars = |line: &str| line.matches('|').count();
-        assert!(lines.iter().all(|line| n_bars(line) == 15), "{text}");
+        assert!(lines.iter().all(|line| n_bars(line) == 16), "{text}");
         assert!(text.contains("| none | no / points here |"), "{text}");
         assert!(text.contains("| slow | 30.00 | - | - | 26.00 |"), "{text}");
     }

@@ -46,6 +46,7 @@ pub(crate) fn measure_quality(
                 continue;
             };
             let psnr = scores.add(&rendering, &photo, is_held_out, lpips);
+            tracing::debug!("keyframe {id}: {psnr:.2} dB, held out: {is_held_out}");
             if i % image_stride == 0 {
                 images.push(Comparison {
                     keyframe_id: *id,

@@ -132,6 +132,12 @@ impl ImagesSource {
         })
     }
 
+    /// Paths of the images that are still to come, in their order; some may be missing.
+    pub fn files(&self) -> Vec<PathBuf> {
+        let entries = self.entries.as_slice().iter();
+        entries.map(|entry| entry.path.clone()).collect()
+    }
+
     fn of_scene(
         path: &Path,
         layout: &Layout,
