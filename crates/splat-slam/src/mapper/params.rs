@@ -99,6 +99,8 @@ pub struct TrainParams {
     /// Share of 1 - SSIM in the photometric loss.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub ssim_weight: f32,
+    /// Order of the views in a round through all of them: spread, so that steps that follow each other see different places; or shuffled.
+    pub view_order: ViewOrder,
     /// What SSIM takes for the pixels beyond the edges: black; or only windows inside the image are averaged (gsplat).
     pub ssim_padding: SsimPadding,
     /// Weight of the photometric loss; 0.95 in the code of FastSplatting.
@@ -156,9 +158,12 @@ pub struct TrainParams {
     /// Adam rate of opacity logits.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_opacity: f32,
-    /// Adam rate of the base colour; the bands above take a twentieth.
+    /// Adam rate of the base colour.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_sh: f32,
+    /// Rate of the colour bands above the base, as a share of train.lr_sh; a twentieth in 3DGS.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub sh_rest_rate: f32,
     /// Steps on a view after which a step on it trains splats at half of these rates; they fall on, to a tenth at least; 0 = they
     /// do not fall.
     #[schemars(range(min = 0, max = 1000000))]
@@ -206,6 +211,7 @@ impl Default for TrainParams {
             seeds_per_keyframe: 5000,
             sh_degree: 3,
             ssim_weight: 0.2,
+            view_order: ViewOrder::Spread,
             ssim_padding: SsimPadding::Zero,
             photo_weight: 1.0,
             weights: LossWeights {
@@ -229,6 +235,7 @@ impl Default for TrainParams {
             lr_quat: 0.006,
             lr_opacity: 0.1,
             lr_sh: 0.02,
+            sh_rest_rate: 0.05,
             half_rate_steps: 30,
             final_rate: 0.2,
             sh_interval: 0,
@@ -389,6 +396,16 @@ pub enum RelocationRule {
     Image,
     /// The opacity along a ray through its centre (3DGS-MCMC).
     Paper,
+}
+
+/// Order of the views in a round of steps through all of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ViewOrder {
+    /// Steps that follow each other are on views that are far apart in the order of arrival.
+    Spread,
+    /// Random.
+    Shuffled,
 }
 
 /// What SSIM takes for the pixels beyond the edges of the image.

@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::mapper::params::{
-    DepthLoss, MapperParams, PoseOptimization, ShInterval, SsimPadding, TrainParams,
+    DepthLoss, MapperParams, PoseOptimization, ShInterval, SsimPadding, TrainParams, ViewOrder,
 };
 use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 
@@ -22,14 +22,14 @@ const STEPS_BEFORE_FILLING: u32 = 4;
 const FINAL_MEAN_RATE: f32 = 0.01;
 /// First pose rate as a share of the standard deviation that the model states: a few steps of a view cover it.
 const RATE_OF_ERROR: f32 = 0.5;
-/// Rate of the SH bands above the base, as a share of the base rate (3DGS).
-const SH_REST_RATE: f32 = 1.0 / 20.0;
+/// Inverse of the golden ratio: the fractional parts of its multiples lie as evenly as those of any number (Kronecker sequence).
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// Draws the view of each step.
 #[derive(Debug)]
 pub struct Schedule {
     rng: Pcg64Mcg,
-    /// Rest of the shuffled round through all views.
+    /// Rest of the round through all views.
     round: Vec<usize>,
     /// Steps on each view of the engine since it was new, or had new depth.
     n_steps: Vec<u32>,
@@ -62,8 +62,8 @@ impl Schedule {
     }
 
     /// One of `trainable`, which is in order of arrival; `None` when it is empty.
-    pub fn next_view(&mut self, trainable: &[usize]) -> Option<usize> {
-        let view_ix = self.draw(trainable)?;
+    pub fn next_view(&mut self, trainable: &[usize], order: ViewOrder) -> Option<usize> {
+        let view_ix = self.draw(trainable, order)?;
         if self.n_steps.len() <= view_ix {
             self.n_steps.resize(view_ix + 1, 0);
         }
@@ -98,7 +98,7 @@ impl Schedule {
         self.round.clear();
     }
 
-    fn draw(&mut self, trainable: &[usize]) -> Option<usize> {
+    fn draw(&mut self, trainable: &[usize], order: ViewOrder) -> Option<usize> {
         let mut newest_first = trainable.iter().rev().copied();
         let lacking = newest_first.find(|v| self.steps_of(*v) < FIRST_STEPS);
         if let Some(new) = lacking.filter(|_| self.rng.random_bool(FIRST_SHARE)) {
@@ -106,10 +106,28 @@ impl Schedule {
         }
         if self.round.is_empty() {
             self.round = trainable.to_vec();
-            self.round.shuffle(&mut self.rng);
+            match order {
+                ViewOrder::Spread => spread(&mut self.round, self.rng.random()),
+                ViewOrder::Shuffled => self.round.shuffle(&mut self.rng),
+            }
         }
         self.round.pop()
     }
+}
+
+/// Views that come after each other in time show the same place, and several steps in a row on one place take the splats away from
+/// what all others show. Sorted by the fractional parts of the multiples of the golden ratio, neighbours in the round are Fibonacci
+/// numbers apart. `turn`, 0 to 1, makes each round another one.
+fn spread(views: &mut Vec<usize>, turn: f64) {
+    let key = |ix: usize| (ix as f64 * GOLDEN + turn).fract();
+    let mut keyed: Vec<(f64, usize)> = views
+        .iter()
+        .enumerate()
+        .map(|(ix, v)| (key(ix), *v))
+        .collect();
+    keyed.sort_by(|a, b| a.0.total_cmp(&b.0));
+    views.clear();
+    views.extend(keyed.into_iter().map(|(_, view_ix)| view_ix));
 }
 
 /// What is known of the end while keyframes come, `has_end`: of a run of `train.steps`.
@@ -174,7 +192,7 @@ pub fn settings(
         lr_quat: of_splats(params.train.lr_quat),
         lr_opacity: of_splats(params.train.lr_opacity),
         lr_sh0: of_splats(params.train.lr_sh),
-        lr_sh_rest: of_splats(params.train.lr_sh * SH_REST_RATE),
+        lr_sh_rest: of_splats(params.train.lr_sh * params.train.sh_rest_rate),
         lr_pose_rotation: decayed(raised(params.train.lr_rotation, pose_error[0]), final_pose),
         lr_pose_translation: decayed(
             raised(params.train.lr_translation * scene_scale, pose_error[1]),
@@ -269,32 +287,63 @@ mod tests {
         assert_eq!(at(&train), [2.0; 3], "never");
     }
 
+    const ORDERS: [ViewOrder; 2] = [ViewOrder::Spread, ViewOrder::Shuffled];
+
     #[test]
     fn a_round_visits_every_view_once() {
-        let mut schedule = Schedule::new(7);
-        schedule.note_trained(20);
-        let views: Vec<usize> = (3..20).collect();
-        let mut drawn: Vec<usize> = views
-            .iter()
-            .filter_map(|_| schedule.next_view(&views))
-            .collect();
-        drawn.sort_unstable();
-        assert_eq!(drawn, views);
-        assert_eq!(schedule.next_view(&[]), None);
+        for order in ORDERS {
+            let mut schedule = Schedule::new(7);
+            schedule.note_trained(20);
+            let views: Vec<usize> = (3..20).collect();
+            let mut draw = || -> Vec<usize> {
+                let each = views.iter();
+                each.filter_map(|_| schedule.next_view(&views, order))
+                    .collect()
+            };
+            let (mut first, second) = (draw(), draw());
+            assert_ne!(first, second, "{order:?}");
+            first.sort_unstable();
+            assert_eq!(first, views);
+            assert_eq!(schedule.next_view(&[], order), None);
+        }
+    }
+
+    #[test]
+    fn steps_that_follow_each_other_are_on_views_far_apart() {
+        for n in [8, 38, 100, 501] {
+            let mut schedule = Schedule::new(7);
+            schedule.note_trained(n);
+            let views: Vec<usize> = (0..n).collect();
+            let round: Vec<usize> = (0..n)
+                .filter_map(|_| schedule.next_view(&views, ViewOrder::Spread))
+                .collect();
+            let nearest = round.windows(2).map(|pair| pair[0].abs_diff(pair[1])).min();
+            assert!(nearest.is_some_and(|apart| apart * 5 > n), "{n}: {round:?}");
+        }
     }
 
     #[test]
     fn new_views_come_soon_and_leave_time_for_the_others() {
-        let mut schedule = Schedule::new(7);
-        let views: Vec<usize> = (0..80).collect();
-        schedule.note_trained(78);
-        let first: Vec<usize> = (0..30).filter_map(|_| schedule.next_view(&views)).collect();
-        assert!(schedule.steps_of(79) >= 1 && schedule.steps_of(78) >= 1);
-        assert!(first.iter().filter(|v| **v < 72).count() > 20, "{first:?}");
+        for order in ORDERS {
+            let mut schedule = Schedule::new(7);
+            let views: Vec<usize> = (0..80).collect();
+            schedule.note_trained(78);
+            let mut draw = |n| -> (Vec<usize>, u32) {
+                let drawn = (0..n).filter_map(|_| schedule.next_view(&views, order));
+                let drawn = drawn.collect();
+                (drawn, schedule.steps_of(78).min(schedule.steps_of(79)))
+            };
+            let (first, n_new) = draw(30);
+            assert!(n_new >= 1, "{order:?}: {first:?}");
+            let n_old = first.iter().filter(|v| **v < 72).count();
+            assert!(n_old > 20, "{order:?}: {first:?}");
 
-        schedule.renew(40);
-        let soon: Vec<usize> = (0..12).filter_map(|_| schedule.next_view(&views)).collect();
-        assert!(soon.iter().filter(|v| **v == 40).count() >= 1, "{soon:?}");
+            schedule.renew(40);
+            let soon: Vec<usize> = (0..20)
+                .filter_map(|_| schedule.next_view(&views, order))
+                .collect();
+            assert!(soon.contains(&40), "{order:?}: {soon:?}");
+        }
     }
 
     #[test]

@@ -145,7 +145,8 @@ impl Trainer {
         map: &mut Parts<'_>,
         end: End,
     ) -> Result<Option<StepSettings>, EngineError> {
-        let Some(view_ix) = self.schedule.next_view(&self.trainable) else {
+        let order = map.params.train.view_order;
+        let Some(view_ix) = self.schedule.next_view(&self.trainable, order) else {
             return Ok(None);
         };
         let scene_depth = map.keyframes.scene_depth();
