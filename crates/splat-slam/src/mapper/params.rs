@@ -235,7 +235,7 @@ impl Default for TrainParams {
             lr_quat: 0.006,
             lr_opacity: 0.1,
             lr_sh: 0.02,
-            sh_rest_rate: 0.05,
+            sh_rest_rate: 0.15,
             half_rate_steps: 30,
             final_rate: 0.2,
             sh_interval: 0,

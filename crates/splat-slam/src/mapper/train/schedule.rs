@@ -13,7 +13,7 @@ use splat_engine::settings::{DepthMode, PoseMode, StepSettings};
 /// share of all steps, and no more: where keyframes come faster than steps, old places must not be forgotten. More of either
 /// costs what all other views show (docs/BENCHMARKS.md).
 const FIRST_STEPS: u32 = 1;
-const FIRST_SHARE: f64 = 0.5;
+const FIRST_SHARE: f64 = 0.25;
 /// Least share of the rates on a view that was trained often.
 const OLD_RATE: f32 = 0.1;
 /// Steps on a view after which its holes are filled where no depth was verified: others have shown by then what they know.
