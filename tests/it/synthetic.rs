@@ -347,3 +347,30 @@ fn blur_softens_what_moves_and_nothing_else() {
     let (still, open) = (detail("&speed=0"), detail("&speed=0&blur=1"));
     assert!(open > 0.9 * still, "{open} of {still}");
 }
+
+/// Share of the pixels that are another colour by more than noise.
+fn changed(a: &RgbImage, b: &RgbImage) -> f64 {
+    let pixels = a.pixels.chunks_exact(3).zip(b.pixels.chunks_exact(3));
+    let is_other = |(p, q): &(&[u8], &[u8])| p.iter().zip(*q).any(|(a, b)| a.abs_diff(*b) > 12);
+    pixels.filter(is_other).count() as f64 / (a.pixels.len() / 3) as f64
+}
+
+#[test]
+fn movers_are_somewhere_else_in_each_image_and_every_tenth_has_none() {
+    let film = |movers: u32| {
+        let mut settings = SynthSettings::of(SceneKind::Room);
+        (settings.width_px, settings.height_px, settings.movers) = (80, 60, movers);
+        Take::new(settings).unwrap()
+    };
+    let (clean, cluttered) = (film(0), film(3));
+    for ix in [5, 15] {
+        assert_eq!(clean.image(ix), cluttered.image(ix), "{ix}");
+    }
+    let shares: Vec<f64> = [0, 1, 2, 6, 7]
+        .iter()
+        .map(|ix| changed(&clean.image(*ix), &cluttered.image(*ix)))
+        .collect();
+    assert!(shares.iter().all(|s| (0.01..0.3).contains(s)), "{shares:?}");
+    let intrinsics = clean.settings().lens().intrinsics;
+    assert_eq!(clean.depth(1, &intrinsics), cluttered.depth(1, &intrinsics));
+}

@@ -54,6 +54,8 @@ mod facade;
 
 mod trajectory;
 
+mod movers;
+
 pub mod take;
 
 mod odometry;

@@ -42,6 +42,7 @@ impl SynthSettings {
                 "noise" => self.noise = number,
                 "exposure" => self.exposure_drift = number,
                 "blur" => self.blur = number,
+                "movers" => self.movers = number as u32,
                 "rate" => self.rate = Some(number),
                 "speed" => self.speed = number,
                 "odometry" => self.odometry = Some(number),
@@ -88,6 +89,7 @@ impl SynthSettings {
                 "noise" => self.noise,
                 "exposure" => self.exposure_drift,
                 "blur" => self.blur,
+                "movers" => f64::from(self.movers),
                 "rate" => self.rate.unwrap_or(RATE),
                 "speed" => self.speed,
                 "odometry" => self.odometry.unwrap_or(0.0),
@@ -145,7 +147,7 @@ impl Range {
     }
 }
 
-const RANGES: [Range; 11] = [
+const RANGES: [Range; 12] = [
     Range::new(
         "frames",
         [1.0, 100_000.0],
@@ -168,6 +170,7 @@ const RANGES: [Range; 11] = [
     Range::new("noise", [0.0, 64.0], false, "8-bit levels in [0, 64]"),
     Range::new("exposure", [0.0, 4.0], false, "stops in [0, 4]"),
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
+    Range::new("movers", [0.0, 100.0], true, "a whole number in [0, 100]"),
     Range::new("odometry", [0.0, 1.0], false, "a share in [0, 1]"),
     Range::new("rate", RATES, false, "frames per second in [1, 1000]"),
     Range::new("speed", [0.0, 100.0], false, "a number in [0, 100]"),

@@ -16,7 +16,7 @@ pub enum SynthError {
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
     #[error(
-        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, rate, speed, seed, quality, depth, odometry"
+        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, movers, rate, speed, seed, quality, depth, odometry"
     )]
     Option { key: String },
     #[error("option {key} of a synthetic scene = {found}, expected {expected}")]
@@ -70,6 +70,8 @@ pub struct SynthSettings {
     pub exposure_drift: f64,
     /// Share of the time between frames that the shutter is open.
     pub blur: f64,
+    /// Things that are somewhere else in each image; every tenth image has none, from the sixth on.
+    pub movers: u32,
     /// Frames per second, at which the source also hands them out live; `None`: 10, as soon as they are drawn.
     pub rate: Option<f64>,
     /// 1 goes round once in 12 s, whatever the rate.
@@ -96,6 +98,7 @@ impl SynthSettings {
             noise: 0.0,
             exposure_drift: 0.0,
             blur: 0.0,
+            movers: 0,
             rate: None,
             speed: 1.0,
             seed: 0,

@@ -11,6 +11,7 @@ use rand_pcg::Pcg32;
 use rayon::prelude::*;
 
 use crate::geometry::Ray;
+use crate::movers::{self, Mover};
 use crate::scene::Scene;
 use crate::settings::{RATE, SceneKind, SynthError, SynthSettings};
 use crate::{corridor, facade, hallway, noise, room, trajectory};
@@ -97,6 +98,8 @@ impl Take {
         );
         let samples = self.samples(ix);
         let gain = self.gain(ix);
+        let (at, n) = ((self.pose(ix), ix), self.settings.movers);
+        let movers = movers::movers(&self.scene, &lens, at, (n, self.settings.seed));
         let mut pixels = vec![0u8; 3 * width * height];
         pixels
             .par_chunks_mut(3 * width)
@@ -108,7 +111,7 @@ impl Take {
                         ^ y as u64,
                 );
                 for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                    let light = self.pixel_light(&lens, &samples, [x, y]);
+                    let light = self.pixel_light(&lens, &samples, &movers, [x, y]);
                     *pixel = expose(light * gain, self.settings.noise as f32, &mut random);
                 }
             });
@@ -119,7 +122,7 @@ impl Take {
         }
     }
 
-    /// Exact z-depth of the pixel centres of an undistorted camera; 0 where nothing is.
+    /// Exact z-depth of the pixel centres of an undistorted camera, of what does not move; 0 where nothing is.
     pub fn depth(&self, ix: u32, intrinsics: &Intrinsics) -> DepthMap {
         let lens = CameraModel {
             intrinsics: *intrinsics,
@@ -190,6 +193,7 @@ impl Take {
         &self,
         lens: &CameraModel,
         samples: &[(DVec2, Rigid)],
+        movers: &[Mover],
         [x, y]: [usize; 2],
     ) -> Vec3 {
         let pixel_angle = SAMPLE_PX / lens.intrinsics.fx;
@@ -205,6 +209,11 @@ impl Take {
                 origin: pose.translation,
                 direction,
             };
+            let mover = movers::meet(movers, &ray);
+            if let Some((_, light)) = mover.filter(|m| self.scene.meet(&ray, m.0).is_none()) {
+                sum += light;
+                continue;
+            }
             // Sensors clip each sample's highlights before the eye would: bright lamps keep soft rims.
             sum += self.scene.radiance(&ray, pixel_angle).min(Vec3::splat(4.0));
         }
