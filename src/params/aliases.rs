@@ -119,7 +119,7 @@ mod tests {
 
     #[test]
     fn each_old_key_sets_the_new_one_and_warns_once() {
-        assert_eq!(old_keys().len(), 71);
+        assert_eq!(old_keys().len(), 77);
         for (old, new) in old_keys() {
             let mut settings = Settings::shipped();
             assert!(settings.value(&old).is_none(), "{old} is still a key");

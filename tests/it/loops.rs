@@ -37,6 +37,7 @@ const ROUGH: Noise = Noise {
     translation: 0.04,
     depth: 0.1,
     outliers: 0.05,
+    ..Noise::STATED
 };
 
 /// Keyframes with what is true of them.

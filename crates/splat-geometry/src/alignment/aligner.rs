@@ -186,14 +186,16 @@ pub fn refine_matched(
         };
         epipolar::align(matched, &settings);
     }
-    if params.method != AlignMethod::Epipolar {
-        let settings = depth_bundle::Settings {
-            depth_error: params.depth_error,
-            moves_focal: !given.is_calibrated,
-        };
-        let depths = depths(views, matched);
-        depth_bundle::align(matched, &tracks, &depths, &settings);
-    }
+    // Epipolar lines say nothing of lengths along them, and depth that is scaled to places that slid along is worse than before: the places
+    // are moved by lines and depth together.
+    let turns = params.method != AlignMethod::Epipolar;
+    let settings = depth_bundle::Settings {
+        depth_error: params.depth_error,
+        moves_focal: turns && !given.is_calibrated,
+        turns,
+    };
+    let depths = depths(views, matched);
+    depth_bundle::align(matched, &tracks, &depths, &settings);
     refined.after_px = epipolar::median_error_px(matched);
     let is_better = refined.after_px <= before_px.map(|b| b * MAX_WORSE);
     if refined.after_px.is_none() || !is_better {

@@ -18,6 +18,8 @@ use splat_types::transform::Rigid;
 /// Pose, log-scale of the view's depth, log-focal.
 const PARAMS: usize = 8;
 const PER_CAMERA: usize = 7;
+/// Of these, the rotation.
+const TURN: std::ops::Range<usize> = 3..6;
 /// Standard deviations that hold what nothing else does: the common unit of all depths, and the focal length.
 const SCALE_PRIOR: f64 = 0.3;
 const FOCAL_PRIOR: f64 = 0.1;
@@ -39,6 +41,8 @@ pub struct Settings {
     /// Relative error that the depth is expected to have.
     pub depth_error: f64,
     pub moves_focal: bool,
+    /// Orientations move; else only places and scales of depth, which leaves what lines said of orientations.
+    pub turns: bool,
 }
 
 /// Moves the poses that are not held, and the focal length if asked. Returns each view's log-scale.
@@ -154,7 +158,8 @@ impl Fixed {
         for (ix, (aligned_view, own)) in matched.views.iter().zip(&mut columns).enumerate() {
             let is_free = !aligned_view.is_held && (is_anchored || ix > 0);
             for (k, column) in own.iter_mut().take(PER_CAMERA).enumerate() {
-                if is_free || k == PER_CAMERA - 1 {
+                let is_turn = TURN.contains(&k);
+                if (is_free && (settings.turns || !is_turn)) || k == PER_CAMERA - 1 {
                     *column = Some(n);
                     n += 1;
                 }

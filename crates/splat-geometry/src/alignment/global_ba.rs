@@ -11,7 +11,7 @@ use crate::alignment::inlier_tracks::{InlierTracks, find_inliers};
 use crate::alignment::kept_views::KeptView;
 use crate::alignment::loops::Loops;
 use crate::alignment::matched::{
-    InitialPoses, MAX_POINT_ERROR_PX, Matched, longest_px, unit, write_back,
+    InitialPoses, MAX_POINT_ERROR_PX, Matched, WindowView, longest_px, unit, write_back,
 };
 use crate::alignment::matches::Matcher;
 use crate::alignment::params::AlignParams;
@@ -20,6 +20,8 @@ use crate::alignment::tracks::{Track, covering_tracks, points};
 use crate::answer::{PoseUpdate, View};
 use crate::optim::bundle::adjust;
 use crate::optim::bundle::problem::{Camera, Observation, Problem, Settings};
+use crate::stats::median;
+use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
 use splat_types::transform::Rigid;
 
@@ -219,6 +221,9 @@ fn adjust_all(
     given: InitialPoses,
 ) {
     let hold = hold(unit(views));
+    if !given.is_calibrated {
+        share_focal(matched);
+    }
     for (limit, max_steps) in ROUNDS {
         let limit = limit * longest_px(matched) / 640.0;
         let inliers = find_inliers(matched, tracks, depths, (limit, depth_error));
@@ -239,6 +244,24 @@ fn adjust_all(
             n_observations[view] += 1;
         }
         take_over(matched, &problem.cameras, &n_observations);
+    }
+}
+
+/// Each window has estimated the focal length of the one camera anew: all get the median, and adjustment moves it for all.
+fn share_focal(matched: &mut Matched) {
+    let focal = |axis: fn(&Intrinsics) -> f64| {
+        let mut all: Vec<f64> = matched.views.iter().map(|view| axis(&view.lens)).collect();
+        median(&mut all)
+    };
+    let (Some(fx), Some(fy)) = (focal(|lens| lens.fx), focal(|lens| lens.fy)) else {
+        return;
+    };
+    let size = |view: &WindowView| (view.lens.width_px, view.lens.height_px);
+    let sizes: BTreeSet<(u32, u32)> = matched.views.iter().map(size).collect();
+    if sizes.len() == 1 {
+        for view in &mut matched.views {
+            (view.lens.fx, view.lens.fy) = (fx, fy);
+        }
     }
 }
 

@@ -111,7 +111,9 @@ impl GroundTruthModel {
             return Ok(GeometryBatch::default());
         };
         aligner.note_stamps(batch.keyframes.iter().map(|k| (k.id, k.frame.stamp)));
-        let joined = aligner.place(window, &images, true);
+        // A network takes the focal length of a calibrated camera, and has no error of it.
+        let is_calibrated = self.params.focal_error == 0.0;
+        let joined = aligner.place(window, &images, is_calibrated);
         tracing::debug!(batch = batch.id, fit = ?joined.fit, refined = ?joined.refined, "window");
         Ok(GeometryBatch {
             batch_id: batch.id,
@@ -148,6 +150,12 @@ impl GroundTruthModel {
             translation: params.translation_noise,
             depth: params.depth_noise,
             outliers: params.depth_outliers,
+            jumps: params.window_jumps,
+            walk_deg: params.walk_deg,
+            walk_translation: params.walk_translation,
+            warp: params.depth_warp,
+            edge_px: params.edge_bleed_px,
+            focal: params.focal_error,
         }
     }
 

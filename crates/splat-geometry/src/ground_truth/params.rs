@@ -3,7 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Parameters `ground_truth.*`: noise, drift and offset that are added to recorded poses and depth.
+/// Parameters `ground_truth.*`: noise, drift and offset that are added to recorded poses and depth. Many fields: a parameter for each kind of
+/// error, switched on its own.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundTruthParams {
@@ -41,6 +42,24 @@ pub struct GroundTruthParams {
     /// With windows, share of the pixels whose depth is wrong by up to half or double.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub depth_outliers: f64,
+    /// With windows, share of those whose scale is drawn between half and double instead.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub window_jumps: f64,
+    /// With windows, standard deviation about each axis by which the error of a pose grows from view to view.
+    #[schemars(range(min = 0.0, max = 90.0), extend("unit" = "deg"))]
+    pub walk_deg: f64,
+    /// The same along each axis, share of the median depth.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub walk_translation: f64,
+    /// With windows, relative standard deviation of depth that is bent over the whole image, half of its variance common to a window.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub depth_warp: f64,
+    /// With windows, pixels of the depth map beside a step in depth in which both sides are mixed.
+    #[schemars(range(min = 0, max = 100))]
+    pub edge_bleed_px: u32,
+    /// With windows, relative standard deviation of the focal length, one for all views of a window; the camera counts as uncalibrated then.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub focal_error: f64,
 }
 
 impl Default for GroundTruthParams {
@@ -57,6 +76,12 @@ impl Default for GroundTruthParams {
             windows: false,
             window_scale: 1.25,
             depth_outliers: 0.0,
+            window_jumps: 0.0,
+            walk_deg: 0.0,
+            walk_translation: 0.0,
+            depth_warp: 0.0,
+            edge_bleed_px: 0,
+            focal_error: 0.0,
         }
     }
 }

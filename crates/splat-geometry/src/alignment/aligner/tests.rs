@@ -125,6 +125,7 @@ fn depth_of_an_unknown_unit_gives_exact_poses_and_its_scale() {
     let settings = depth_bundle::Settings {
         depth_error: 0.05,
         moves_focal: false,
+        turns: true,
     };
     let scales = depth_bundle::align(&mut matched, &tracks, &depths, &settings);
     assert!(worst_turn_deg(&matched, &truth) < 0.02);
@@ -150,6 +151,7 @@ fn held_views_stay_and_the_others_come_to_their_frame() {
     let settings = depth_bundle::Settings {
         depth_error: 0.05,
         moves_focal: false,
+        turns: true,
     };
     depth_bundle::align(&mut matched, &tracks, &depths, &settings);
     assert_eq!(matched.views[1].cam_from_submap, truth[1]);
