@@ -1,5 +1,5 @@
 //! True views -> what a foundation model might say of them: its own frame and unit for each window, poses that are off by noise and by
-//! errors that grow along the window, a focal length that is off, depth that is bent over the whole image, smeared across edges, noisy and
+//! errors that grow along the window, a focal length that is off, depth that is warped over the whole image, smeared across edges, noisy and
 //! now and then far off, and a confidence that half knows where.
 //!
 //! docs/ALIGNMENT.md states the model. For tests and for `ground_truth.windows`.
@@ -50,7 +50,7 @@ pub struct Noise {
     pub walk_deg: f64,
     /// The same of the place along each axis, share of the median depth.
     pub walk_translation: f64,
-    /// Relative standard deviation of depth that is bent smoothly over the whole image, half of the variance common to the window.
+    /// Relative standard deviation of depth that is warped smoothly over the whole image, half of the variance common to the window.
     pub warp: f64,
     /// Pixels of the depth map, to either side of a step in depth, over which the depths of both sides are mixed.
     pub edge_px: u32,
@@ -132,7 +132,7 @@ struct Walk {
     focal: f64,
     /// Of the view before, as translation and rotation in the camera.
     error: (DVec3, DVec3),
-    bend: Bend,
+    warp: Warp,
 }
 
 impl Walk {
@@ -142,7 +142,7 @@ impl Walk {
             jumps: rng.random::<f64>() < noise.jumps,
             focal: (noise.focal * normal(&mut rng)).exp(),
             error: (DVec3::ZERO, DVec3::ZERO),
-            bend: Bend::draw(&mut rng),
+            warp: Warp::draw(&mut rng),
             rng,
         }
     }
@@ -155,14 +155,14 @@ impl Walk {
         view.intrinsics.fx *= self.focal;
         view.intrinsics.fy *= self.focal;
         let edges = smear_edges(&mut view.depth, noise.edge_px as usize);
-        let own = Bend::draw(&mut self.rng);
+        let own = Warp::draw(&mut self.rng);
         if noise.warp > 0.0 {
-            let (bend, width) = (self.bend, view.depth.width_px as usize);
+            let (common, width) = (self.warp, view.depth.width_px as usize);
             let size = [width as f64, f64::from(view.depth.height_px)];
             for (at, depth) in view.depth.depth.iter_mut().enumerate() {
                 let u = ((at % width) as f64 + 0.5) / size[0] * 2.0 - 1.0;
                 let v = ((at / width) as f64 + 0.5) / size[1] * 2.0 - 1.0;
-                let both = (bend.at(u, v) + own.at(u, v)) * std::f64::consts::FRAC_1_SQRT_2;
+                let both = (common.at(u, v) + own.at(u, v)) * std::f64::consts::FRAC_1_SQRT_2;
                 *depth *= (noise.warp * both).exp() as f32;
             }
         }
@@ -172,9 +172,9 @@ impl Walk {
 
 /// A slope and a bowl over the image, with a mean square of 1 over draws and pixels.
 #[derive(Debug, Clone, Copy)]
-struct Bend([f64; 3]);
+struct Warp([f64; 3]);
 
-impl Bend {
+impl Warp {
     fn draw(rng: &mut Pcg64Mcg) -> Self {
         Self(std::array::from_fn(|_| normal(rng)))
     }
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn bent_depth_is_as_far_off_as_is_said_and_smooth() {
+    fn warped_depth_is_as_far_off_as_is_said_and_smooth() {
         let noise = Noise { warp: 0.1, ..NONE };
         let log = |view: &View, exact: &View, at: usize| {
             f64::from(view.depth.depth[at] / exact.depth.depth[at]).ln()

@@ -51,7 +51,7 @@ pub struct GroundTruthParams {
     /// The same along each axis, share of the median depth.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub walk_translation: f64,
-    /// With windows, relative standard deviation of depth that is bent over the whole image, half of its variance common to a window.
+    /// With windows, relative standard deviation of depth that is warped over the whole image, half of its variance common to a window.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub depth_warp: f64,
     /// With windows, pixels of the depth map beside a step in depth in which both sides are mixed.
