@@ -92,10 +92,9 @@ fn is_held_out(name: &str, every: u32) -> bool {
 /// The images of a scene, named by their numbers in the source: files as they are, frames of a recording as PNG.
 fn gather(scene: &Path, to: &Path, params: &SourceParams, seed: u64) -> anyhow::Result<()> {
     fs::create_dir_all(to)?;
-    if Layout::find(scene).is_some() || (scene.is_dir() && has_images(scene)) {
-        if let Ok(source) = ImagesSource::open(scene, params, seed) {
-            return link_files(&source.files(), to);
-        }
+    let is_folder = Layout::find(scene).is_some() || (scene.is_dir() && has_images(scene));
+    if is_folder && let Ok(source) = ImagesSource::open(scene, params, seed) {
+        return link_files(&source.files(), to);
     }
     let mut source = open_source::open(&scene.to_string_lossy(), params, seed)?;
     while let Some(frame) = source.next() {

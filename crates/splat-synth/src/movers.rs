@@ -72,7 +72,7 @@ pub(crate) fn meet<'a>(movers: &'a [Mover], ray: &Ray) -> Option<(f64, Vec3)> {
         let along = to_centre.dot(ray.direction);
         let squared = mover.radius * mover.radius - (to_centre.length_squared() - along * along);
         let distance = along - squared.max(0.0).sqrt();
-        (squared > 0.0 && distance > 0.0).then(|| (distance, mover))
+        (squared > 0.0 && distance > 0.0).then_some((distance, mover))
     };
     let nearest = movers.iter().filter_map(one);
     let (distance, mover) = nearest.min_by(|a, b| a.0.total_cmp(&b.0))?;
