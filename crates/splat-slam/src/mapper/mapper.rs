@@ -47,8 +47,7 @@ use splat_types::sparse_point::SparsePoint;
 
 /// Keyframes without a pose that are kept in case the model places them later.
 pub const MAX_WAITING: usize = 200;
-/// Steps between looks at a view for what moved in it, where it is not looked at to seed, and between removals of transparent splats.
-const MASK_EVERY: u64 = 50;
+/// Steps between removals of transparent splats.
 const PRUNE_EVERY: u64 = 400;
 /// Steps between looks at the depth of one view, while more views are to come: they wait for nothing that takes long.
 const SCALE_ONE_EVERY: u64 = 3;
@@ -201,12 +200,9 @@ impl Mapper {
             let n_steps = trainer.n_steps();
             let train = &parts.params.train;
             let may_change = !matches!(end, End::Nears(share) if share > train.refine_until);
-            let look_every = match train.reseed_every {
-                0 => MASK_EVERY,
-                every => every,
-            };
-            if may_change && n_steps.is_multiple_of(look_every) {
-                trainer.seed_and_mask(&mut parts, end)?;
+            let reseeds = train.reseed_every > 0 && n_steps.is_multiple_of(train.reseed_every);
+            if may_change && reseeds {
+                trainer.seed_again(&mut parts, end)?;
             }
             trainer.record_loss_at_interval(parts.engine)?;
             if may_change && n_steps.is_multiple_of(PRUNE_EVERY) {

@@ -23,6 +23,10 @@ use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 use splat_types::transform::Rigid;
 
+/// Steps on a view, itself among them, from which on the map shows what stands still well enough to say what moved: a view is looked at
+/// there, and whenever it has had twice as many.
+const FIRST_MASK: u32 = 4;
+
 /// The optimisation of the map.
 #[derive(Debug)]
 pub(crate) struct Trainer {
@@ -149,6 +153,13 @@ impl Trainer {
         let Some(view_ix) = self.schedule.next_view(&self.trainable, order) else {
             return Ok(None);
         };
+        let n_steps = self.schedule.steps_of(view_ix);
+        if n_steps >= FIRST_MASK
+            && n_steps.is_power_of_two()
+            && let Some(id) = keyframe_of(map, view_ix)
+        {
+            grow_prune::mask_transients(map, id)?;
+        }
         let scene_depth = map.keyframes.scene_depth();
         let scene_scale = self.camera_radius.unwrap_or(scene_depth);
         let pose_error = map.keyframes.pose_error();
@@ -185,26 +196,15 @@ impl Trainer {
         Ok(())
     }
 
-    /// Looks at one training view: seeds where the map has a hole or is wrong, and notes what has moved in it.
-    pub(crate) fn seed_and_mask(
-        &mut self,
-        map: &mut Parts<'_>,
-        end: End,
-    ) -> Result<(), EngineError> {
+    /// Looks at one training view: seeds where the map has a hole or is wrong.
+    pub(crate) fn seed_again(&mut self, map: &mut Parts<'_>, end: End) -> Result<(), EngineError> {
         if self.trainable.is_empty() {
             return Ok(());
         }
         let view_ix = self.trainable[self.rng.random_range(0..self.trainable.len())];
-        let mut registered = map.keyframes.registered().iter();
-        let id = registered
-            .find(|(_, p)| p.view_ix == view_ix)
-            .map(|(id, _)| *id);
-        if let Some(id) = id {
-            grow_prune::mask_transients(map, id)?;
+        if let Some(id) = keyframe_of(map, view_ix) {
             let fills_gaps = self.schedule.may_fill(view_ix, end);
-            if map.params.train.reseed_every > 0 {
-                grow_prune::seed_from(map, &mut self.rng, id, fills_gaps)?;
-            }
+            grow_prune::seed_from(map, &mut self.rng, id, fills_gaps)?;
         }
         Ok(())
     }
@@ -273,4 +273,10 @@ impl Trainer {
         let scratch_view = &mut self.scratch_view;
         photometric::refine_frame(map, scratch_view, image, intrinsics, world_from_cam)
     }
+}
+
+fn keyframe_of(map: &Parts<'_>, view_ix: usize) -> Option<u32> {
+    let mut registered = map.keyframes.registered().iter();
+    let found = registered.find(|(_, p)| p.view_ix == view_ix);
+    found.map(|(id, _)| *id)
 }
