@@ -1,4 +1,4 @@
-// update_view: sums over splats and pixels -> the view's pose and exposure, the shared network and the focal factor after
+// update_view: sums over splats and pixels -> the view's pose and exposure, the shared networks and the focal factor after
 // one update, and the statistics of the step.
 // Last stage of a step. One workgroup of 64 threads. Equations: docs/GRADIENTS.md, pose, pose network and Adam.
 
@@ -7,6 +7,8 @@
 #import quat
 #import adam
 #import pose_network
+#import appearance
+#import mlp_update
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> camera: Camera;
@@ -21,16 +23,13 @@
 // Share of itself, times the rate, that each number of the exposure loses in an update: without it, all views and all
 // splats could grow brighter together.
 const EXPOSURE_PULL: f32 = 0.1;
-// Twentyfold, and the whole range of colour: beyond is no exposure but a broken image.
-const MAX_GAIN: f32 = 3.0;
-const MAX_OFFSET: f32 = 1.0;
+// Embeddings of the appearance network move so many times as fast as the network; its weight decay.
+const APPEARANCE_EMBEDDING_RATE: f32 = 10.0;
+const APPEARANCE_DECAY: f32 = 1e-6;
 const STATS_GRADIENTS: u32 = 8u;
 
 var<workgroup> partial: array<vec4<f32>, 448>;
 var<workgroup> totals: array<vec4<f32>, 7>;
-var<workgroup> g_output: array<f32, 9>;
-var<workgroup> g_hidden_2: array<f32, 64>;
-var<workgroup> g_hidden_1: array<f32, 64>;
 
 fn add_up(lane: u32) {
     let n_pose = (camera.n_visible + 255u) / 256u;
@@ -139,7 +138,7 @@ fn update_exposure(record: u32) {
         views[record + VIEW_EXPOSURE_M + i] = m;
         views[record + VIEW_EXPOSURE_V + i] = v;
         let moved = value - step.lr_exposure * (adam_direction(m, v, correction, VIEW_EPS) + EXPOSURE_PULL * value);
-        let bound = select(MAX_OFFSET, MAX_GAIN, i < 3u);
+        let bound = max_abs_exposure(i);
         views[record + VIEW_EXPOSURE + i] = clamp(moved, -bound, bound);
     }
 }
@@ -180,61 +179,42 @@ fn differentiate_increment() {
     }
 }
 
-fn update_parameter(at: u32, g: f32, correction: vec2<f32>) {
-    let m = BETA_1 * network[NET_SIZE + at] + (1.0 - BETA_1) * g;
-    let v = BETA_2 * network[2u * NET_SIZE + at] + (1.0 - BETA_2) * g * g;
-    network[NET_SIZE + at] = m;
-    network[2u * NET_SIZE + at] = v;
-    network[at] -= step.lr_pose_network * adam_direction(m, v, correction, VIEW_EPS);
-}
-
 fn update_network(record: u32, lane: u32) {
     if lane == 0u {
         differentiate_increment();
     }
-    workgroupBarrier();
-    var sum = 0.0;
-    for (var o = 0u; o < 9u; o += 1u) {
-        sum += network[NET_W3 + o * N_WIDTH + lane] * g_output[o];
-    }
-    g_hidden_2[lane] = select(0.0, sum, hidden_2[lane] > 0.0);
-    workgroupBarrier();
-    sum = 0.0;
-    for (var i = 0u; i < N_WIDTH; i += 1u) {
-        sum += network[NET_W2 + i * N_WIDTH + lane] * g_hidden_2[i];
-    }
-    g_hidden_1[lane] = select(0.0, sum, hidden_1[lane] > 0.0);
-    workgroupBarrier();
-    var g_embedding = 0.0;
-    for (var i = 0u; i < N_WIDTH; i += 1u) {
-        g_embedding += network[NET_W1 + i * N_WIDTH + lane] * g_hidden_1[i];
-    }
     let age = u32(network[NET_AGE]) + 1u;
     let embedding_age = u32(views[record + VIEW_EMBEDDING_AGE]) + 1u;
-    // All have read the old parameters before any is written.
-    workgroupBarrier();
-    storageBarrier();
-    let correction = corrections(age);
-    for (var i = 0u; i < N_WIDTH; i += 1u) {
-        update_parameter(NET_W1 + lane * N_WIDTH + i, g_hidden_1[lane] * embedding[i], correction);
-        update_parameter(NET_W2 + lane * N_WIDTH + i, g_hidden_2[lane] * hidden_1[i], correction);
-        if i < 9u {
-            update_parameter(NET_W3 + i * N_WIDTH + lane, g_output[i] * hidden_2[lane], correction);
-        }
-    }
-    update_parameter(NET_B1 + lane, g_hidden_1[lane], correction);
-    update_parameter(NET_B2 + lane, g_hidden_2[lane], correction);
-    if lane < 9u {
-        update_parameter(NET_B3 + lane, g_output[lane], correction);
-    }
-    let m = BETA_1 * views[record + VIEW_EMBEDDING_M + lane] + (1.0 - BETA_1) * g_embedding;
-    let v = BETA_2 * views[record + VIEW_EMBEDDING_V + lane] + (1.0 - BETA_2) * g_embedding * g_embedding;
-    views[record + VIEW_EMBEDDING_M + lane] = m;
-    views[record + VIEW_EMBEDDING_V + lane] = v;
-    views[record + VIEW_EMBEDDING + lane] -= step.lr_pose_network * adam_direction(m, v, corrections(embedding_age), VIEW_EPS);
+    let rate = step.lr_pose_network;
+    let g = mlp_update(0u, N_WIDTH, 9u, MlpRates(age, rate, 0.0), lane);
+    let at = record + lane;
+    update_embedding(
+        at + VIEW_EMBEDDING, at + VIEW_EMBEDDING_M, at + VIEW_EMBEDDING_V, g, MlpRates(embedding_age, rate, 0.0),
+    );
     if lane == 0u {
         network[NET_AGE] = f32(age);
         views[record + VIEW_EMBEDDING_AGE] = f32(embedding_age);
+    }
+}
+
+fn update_appearance(record: u32, lane: u32) {
+    appearance_forward(record, lane);
+    if lane < 6u {
+        let g = select(totals[5][lane % 3u], totals[4][lane % 3u], lane < 3u);
+        g_output[lane] = select(g, 0.0, abs(output[lane]) > max_abs_exposure(lane));
+    }
+    let age = u32(network[APPEARANCE_NET_AGE]) + 1u;
+    let embedding_age = u32(views[record + VIEW_APPEARANCE_AGE]) + 1u;
+    let rate = step.lr_appearance;
+    let g = mlp_update(APPEARANCE_NET, N_APPEARANCE, 6u, MlpRates(age, rate, APPEARANCE_DECAY), lane);
+    if lane < N_APPEARANCE {
+        let at = record + lane;
+        let rates = MlpRates(embedding_age, APPEARANCE_EMBEDDING_RATE * rate, APPEARANCE_DECAY);
+        update_embedding(at + VIEW_APPEARANCE, at + VIEW_APPEARANCE_M, at + VIEW_APPEARANCE_V, g, rates);
+    }
+    if lane == 0u {
+        network[APPEARANCE_NET_AGE] = f32(age);
+        views[record + VIEW_APPEARANCE_AGE] = f32(embedding_age);
     }
 }
 
@@ -269,5 +249,8 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     }
     if (step.flags & FLAG_POSE_SHARED) != 0u && (step.flags & FLAG_POSE_NETWORK) != 0u {
         update_network(record, lane);
+    }
+    if step.lr_appearance > 0.0 && is_finite4(totals[4]) && is_finite4(totals[5]) {
+        update_appearance(record, lane);
     }
 }

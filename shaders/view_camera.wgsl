@@ -1,10 +1,11 @@
-// view_camera: a view's pose, focal factor, exposure and the shared network -> the camera of a step.
+// view_camera: a view's pose, focal factor, exposure and the shared networks -> the camera of a step.
 // First stage of a step. One workgroup. Equations: docs/GRADIENTS.md, pose network.
 
 #import step
 #import camera
 #import quat
 #import pose_network
+#import appearance
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read_write> views: array<f32>;
@@ -14,6 +15,13 @@
 @compute @workgroup_size(64)
 fn main(@builtin(local_invocation_index) lane: u32) {
     let record = step.view_ix * VIEW_STRIDE;
+    var shared_exposure = array<f32, 6>();
+    if (step.flags & FLAG_APPEARANCE) != 0u {
+        appearance_forward(record, lane);
+        for (var i = 0u; i < 6u; i += 1u) {
+            shared_exposure[i] = clamp(output[i], -max_abs_exposure(i), max_abs_exposure(i));
+        }
+    }
     network_forward(record, lane);
     if lane != 0u {
         return;
@@ -43,8 +51,12 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     camera.pinhole = vec4<f32>(focal, principal);
     camera.slope_bounds = vec4<f32>(-(principal / focal + beyond), (size_px - principal) / focal + beyond);
     let e = record + VIEW_EXPOSURE;
-    camera.gain = vec4<f32>(exp(vec3<f32>(views[e], views[e + 1u], views[e + 2u])), 0.0);
-    camera.offset = vec4<f32>(views[e + 3u], views[e + 4u], views[e + 5u], 0.0);
+    var exposure = shared_exposure;
+    for (var i = 0u; i < 6u; i += 1u) {
+        exposure[i] += views[e + i];
+    }
+    camera.gain = vec4<f32>(exp(vec3<f32>(exposure[0], exposure[1], exposure[2])), 0.0);
+    camera.offset = vec4<f32>(exposure[3], exposure[4], exposure[5], 0.0);
     for (var i = 0u; i < 9u; i += 1u) {
         views[record + VIEW_NOW + i] = rotation[i / 3u][i % 3u];
     }

@@ -32,6 +32,7 @@ struct Step {
     lr_pose_network: f32,
     lr_focal: f32,
     lr_exposure: f32,
+    lr_appearance: f32,
     noise: f32,
     noise_seed: u32,
     ssim_weight: f32,
@@ -67,6 +68,8 @@ const FLAG_POSE_NETWORK: u32 = 32u;
 const FLAG_ALL_SPLATS: u32 = 64u;
 // Gradients by the projected means are added up.
 const FLAG_SCREEN_GRADIENTS: u32 = 128u;
+// The appearance network has begun.
+const FLAG_APPEARANCE: u32 = 256u;
 
 // On the bits: a compiler may assume that NaN never happens.
 fn is_finite(x: f32) -> bool {

@@ -15,22 +15,23 @@ const VIEW_EXPOSURE_V: u32 = 38u;
 // cam_from_world as the last step used it: rotation by columns, translation.
 const VIEW_NOW: u32 = 44u;
 const VIEW_EMBEDDING_AGE: u32 = 56u;
+const VIEW_APPEARANCE_AGE: u32 = 57u;
 const VIEW_EMBEDDING: u32 = 64u;
 const VIEW_EMBEDDING_M: u32 = 128u;
 const VIEW_EMBEDDING_V: u32 = 192u;
-const VIEW_STRIDE: u32 = 256u;
+const VIEW_APPEARANCE: u32 = 256u;
+const VIEW_APPEARANCE_M: u32 = 272u;
+const VIEW_APPEARANCE_V: u32 = 288u;
+const VIEW_STRIDE: u32 = 320u;
 
 // The shared network (3R-GS): parameters, first moments, second moments, then what else is shared.
-const N_WIDTH: u32 = 64u;
-const NET_W1: u32 = 0u;
-const NET_B1: u32 = 4096u;
-const NET_W2: u32 = 4160u;
-const NET_B2: u32 = 8256u;
-const NET_W3: u32 = 8320u;
-const NET_B3: u32 = 8896u;
 const NET_SIZE: u32 = 8905u;
 const NET_AGE: u32 = 26715u;
 const LOG_FOCAL: u32 = 26716u;
 const LOG_FOCAL_M: u32 = 26717u;
 const LOG_FOCAL_V: u32 = 26718u;
 const LOG_FOCAL_AGE: u32 = 26719u;
+// The appearance network: parameters, first and second moments, age. Numbers of a view's embedding.
+const N_APPEARANCE: u32 = 16u;
+const APPEARANCE_NET: u32 = 26720u;
+const APPEARANCE_NET_AGE: u32 = 43634u;

@@ -104,6 +104,7 @@ fn the_step_has_the_layout_of_the_host() {
         lr_pose_network,
         lr_focal,
         lr_exposure,
+        lr_appearance,
         noise,
         noise_seed,
         ssim_weight,
@@ -269,9 +270,11 @@ fn shared_numbers_are_those_of_the_host() {
         ("VIEW_POSE_AGE", types::VIEW_POSE_AGE),
         ("VIEW_EMBEDDING_AGE", types::VIEW_EMBEDDING_AGE),
         ("VIEW_EMBEDDING", types::VIEW_EMBEDDING),
+        ("VIEW_APPEARANCE", types::VIEW_APPEARANCE),
         ("VIEW_STRIDE", types::VIEW_STRIDE),
         ("NET_SIZE", types::NET_SIZE),
         ("LOG_FOCAL", types::LOG_FOCAL),
+        ("APPEARANCE_NET", types::APPEARANCE_NET),
     ] {
         check("update_view", constant, expected as u64);
     }
@@ -283,6 +286,7 @@ fn shared_numbers_are_those_of_the_host() {
         ("FLAG_DEPTH", types::FLAG_DEPTH),
         ("FLAG_POSE_NETWORK", types::FLAG_POSE_NETWORK),
         ("FLAG_SCREEN_GRADIENTS", types::FLAG_SCREEN_GRADIENTS),
+        ("FLAG_APPEARANCE", types::FLAG_APPEARANCE),
     ] {
         check("update_view", constant, u64::from(expected));
     }

@@ -112,7 +112,11 @@ pub mod loss_weights;
 
 pub mod settings;
 
+pub mod mlp;
+
 pub mod pose_network;
+
+pub mod appearance;
 
 pub mod sh_rotation;
 

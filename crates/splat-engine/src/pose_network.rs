@@ -1,15 +1,12 @@
 //! The network that all views share: a view's embedding -> a motion of its camera, and the way back (3R-GS).
 //!
-//! Knows nothing of images. Parameters stand in one flat array that every backend shares; the arithmetic here is
-//! f64. Equations: docs/GRADIENTS.md, section 8.
+//! Knows nothing of images. Equations: docs/GRADIENTS.md, section 8.
 
 use std::f32::consts::TAU;
-use std::ops::Range;
 
 use glam::{DMat3, DQuat, DVec3};
-use rand::{RngExt, SeedableRng};
-use rand_pcg::Pcg64Mcg;
 
+use crate::mlp::{Layers, Mlp, MlpGradient, Moments, Rates};
 use crate::settings::{FirstEmbedding, PoseNetworkSettings};
 use splat_types::transform::{Rigid, skew};
 
@@ -18,27 +15,11 @@ pub const WIDTH: usize = 64;
 /// Three of translation, six of rotation.
 pub const N_OUTPUTS: usize = 9;
 
-/// Where the first layer's weights stand in the flat parameters; matrices row by row, one row per output.
-pub const W1: Range<usize> = 0..WIDTH * WIDTH;
-/// First layer's biases.
-pub const B1: Range<usize> = W1.end..W1.end + WIDTH;
-/// Second layer's weights.
-pub const W2: Range<usize> = B1.end..B1.end + WIDTH * WIDTH;
-/// Second layer's biases.
-pub const B2: Range<usize> = W2.end..W2.end + WIDTH;
-/// Last layer's weights.
-pub const W3: Range<usize> = B2.end..B2.end + N_OUTPUTS * WIDTH;
-/// Last layer's biases.
-pub const B3: Range<usize> = W3.end..W3.end + N_OUTPUTS;
-/// All parameters.
-pub const N_PARAMETERS: usize = B3.end;
-
-/// Decay of Adam's first moment.
-pub const BETA_1: f64 = 0.9;
-/// Decay of Adam's second moment.
-pub const BETA_2: f64 = 0.999;
-/// Added to the root of Adam's second moment.
-pub const EPS: f64 = 1e-8;
+/// Three of translation, six of rotation: three numbers in units of `camera_scale`, then what is added to the first two rows of the identity
+/// (Zhou et al. 2019).
+pub type PoseMlp = Mlp<WIDTH, WIDTH, N_OUTPUTS>;
+/// What the layers of one forward pass answered.
+pub type PoseLayers = Layers<WIDTH, WIDTH, N_OUTPUTS>;
 
 /// Views in the shortest wave of an embedding: shorter ones would follow the noise of single views.
 const FIRST_WAVE: usize = 16;
@@ -72,78 +53,30 @@ pub fn first_embedding(kind: FirstEmbedding, view_ix: usize) -> Embedding {
     embedding
 }
 
-/// Adam's state of an array of parameters.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Moments {
-    first: Vec<f32>,
-    second: Vec<f32>,
-    age: u32,
-}
-
 /// The shared network and its optimiser.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseNetwork {
-    /// `N_PARAMETERS` numbers.
-    pub parameters: Vec<f32>,
+    /// From a view's embedding to the nine numbers of its motion.
+    pub mlp: PoseMlp,
     /// World units that an output of 1 moves a camera by.
     pub camera_scale: f64,
     /// What embeddings of new views are at first.
     pub embedding: FirstEmbedding,
-    moments: Moments,
-}
-
-/// What the layers of one forward pass answered; hidden ones after the ReLU.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Layers {
-    /// The view's, as given.
-    pub embedding: [f64; WIDTH],
-    /// First hidden layer.
-    pub hidden_1: [f64; WIDTH],
-    /// Second hidden layer.
-    pub hidden_2: [f64; WIDTH],
-    /// Translation (3) in units of `camera_scale`, then rotation (6), added to the first two rows of the identity
-    /// (Zhou et al. 2019).
-    pub output: [f64; N_OUTPUTS],
-}
-
-/// Gradient of a loss with respect to all parameters and one view's embedding.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PoseNetworkGradient {
-    /// `N_PARAMETERS` numbers, in the order of [`W1`] to [`B3`].
-    pub parameters: Vec<f64>,
-    /// Of the view that the loss is of.
-    pub embedding: [f64; WIDTH],
 }
 
 impl PoseNetwork {
     /// Hidden layers are random, the last one is zero: every camera starts where it is.
     pub fn new(settings: &PoseNetworkSettings) -> Self {
-        let mut rng = Pcg64Mcg::seed_from_u64(settings.seed ^ 0x5eed_0003);
-        let mut parameters = vec![0.0; N_PARAMETERS];
-        for value in &mut parameters[..B2.end] {
-            *value = rng.random_range(-FIRST_BOUND..FIRST_BOUND);
-        }
         Self {
-            parameters,
+            mlp: Mlp::new(settings.seed ^ 0x5eed_0003, FIRST_BOUND),
             camera_scale: f64::from(settings.camera_scale),
             embedding: settings.embedding,
-            moments: Moments::default(),
         }
     }
 
     /// The layers' answers for one view.
-    pub fn forward(&self, embedding: &Embedding) -> Layers {
-        let p = &self.parameters;
-        let embedding = embedding.map(f64::from);
-        let relu = |v: f64| v.max(0.0);
-        let hidden_1 = linear::<WIDTH>(&p[W1], &p[B1], &embedding).map(relu);
-        let hidden_2 = linear::<WIDTH>(&p[W2], &p[B2], &hidden_1).map(relu);
-        Layers {
-            output: linear::<N_OUTPUTS>(&p[W3], &p[B3], &hidden_2),
-            embedding,
-            hidden_1,
-            hidden_2,
-        }
+    pub fn forward(&self, embedding: &Embedding) -> PoseLayers {
+        self.mlp.forward(embedding)
     }
 
     /// `base_from_cam`: the camera's own motion, `world_from_cam = world_from_base * base_from_cam`.
@@ -163,26 +96,9 @@ impl PoseNetwork {
     }
 
     /// `pose_gradient` is that of (rho, theta) in `exp([rho; theta]) * cam_from_world`, at the moved camera.
-    pub fn backward(&self, layers: &Layers, pose_gradient: [f64; 6]) -> PoseNetworkGradient {
+    pub fn backward(&self, layers: &PoseLayers, pose_gradient: [f64; 6]) -> MlpGradient<WIDTH> {
         let g_output = output_gradient(&layers.output, self.camera_scale, pose_gradient);
-        let p = &self.parameters;
-        let mut gradient = vec![0.0; N_PARAMETERS];
-        let mut step =
-            |weights: Range<usize>, biases: Range<usize>, input: &[f64; WIDTH], g: &[f64]| {
-                gradient[biases].copy_from_slice(g);
-                for (row, g) in gradient[weights].chunks_exact_mut(WIDTH).zip(g) {
-                    row.iter_mut().zip(input).for_each(|(w, x)| *w = g * x);
-                }
-            };
-        step(W3, B3, &layers.hidden_2, &g_output);
-        let g_hidden_2 = before_relu(transposed(&p[W3], &g_output), &layers.hidden_2);
-        step(W2, B2, &layers.hidden_1, &g_hidden_2);
-        let g_hidden_1 = before_relu(transposed(&p[W2], &g_hidden_2), &layers.hidden_1);
-        step(W1, B1, &layers.embedding, &g_hidden_1);
-        PoseNetworkGradient {
-            embedding: transposed(&p[W1], &g_hidden_1),
-            parameters: gradient,
-        }
+        self.mlp.backward(layers, &g_output)
     }
 
     /// One update of the network and of the view's embedding. false: the gradient is not finite, nothing changed.
@@ -190,35 +106,15 @@ impl PoseNetwork {
         &mut self,
         embedding: &mut Embedding,
         moments: &mut Moments,
-        gradient: &PoseNetworkGradient,
+        gradient: &MlpGradient<WIDTH>,
         rate: f32,
     ) -> bool {
-        let parts = [&gradient.parameters[..], &gradient.embedding];
-        if parts.iter().any(|part| part.iter().any(|g| !g.is_finite())) {
-            return false;
-        }
-        self.moments
-            .update(&mut self.parameters, &gradient.parameters, rate);
-        moments.update(embedding, &gradient.embedding, rate);
-        true
-    }
-}
-
-impl Moments {
-    fn update(&mut self, values: &mut [f32], gradient: &[f64], rate: f32) {
-        self.first.resize(values.len(), 0.0);
-        self.second.resize(values.len(), 0.0);
-        self.age = self.age.saturating_add(1);
-        let unbias_1 = 1.0 - BETA_1.powf(f64::from(self.age));
-        let unbias_2 = 1.0 - BETA_2.powf(f64::from(self.age));
-        let moments = self.first.iter_mut().zip(&mut self.second);
-        for ((value, g), (first, second)) in values.iter_mut().zip(gradient).zip(moments) {
-            let m = BETA_1 * f64::from(*first) + (1.0 - BETA_1) * g;
-            let v = BETA_2 * f64::from(*second) + (1.0 - BETA_2) * g * g;
-            (*first, *second) = (m as f32, v as f32);
-            let direction = m / unbias_1 / ((v / unbias_2).sqrt() + EPS);
-            *value = (f64::from(*value) - f64::from(rate) * direction) as f32;
-        }
+        let rates = Rates {
+            parameters: rate,
+            input: rate,
+            decay: 0.0,
+        };
+        self.mlp.update(embedding, moments, gradient, &rates)
     }
 }
 
@@ -296,34 +192,5 @@ fn output_gradient(
     let mut g = [0.0; N_OUTPUTS];
     g[..3].copy_from_slice(&g_dx.to_array());
     g[3..].copy_from_slice(&g_dr);
-    g
-}
-
-fn linear<const ROWS: usize>(weights: &[f32], biases: &[f32], input: &[f64; WIDTH]) -> [f64; ROWS] {
-    std::array::from_fn(|row| {
-        let products = weights[row * WIDTH..(row + 1) * WIDTH]
-            .iter()
-            .zip(input)
-            .map(|(w, x)| f64::from(*w) * x);
-        f64::from(biases[row]) + products.sum::<f64>()
-    })
-}
-
-fn transposed(weights: &[f32], g: &[f64]) -> [f64; WIDTH] {
-    let mut out = [0.0; WIDTH];
-    for (row, g) in weights.chunks_exact(WIDTH).zip(g) {
-        out.iter_mut()
-            .zip(row)
-            .for_each(|(out, w)| *out += f64::from(*w) * g);
-    }
-    out
-}
-
-fn before_relu(mut g: [f64; WIDTH], after: &[f64; WIDTH]) -> [f64; WIDTH] {
-    for (g, after) in g.iter_mut().zip(after) {
-        if *after <= 0.0 {
-            *g = 0.0;
-        }
-    }
     g
 }

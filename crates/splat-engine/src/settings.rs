@@ -105,6 +105,8 @@ pub struct StepSettings {
     pub lr_focal: f32,
     /// Adam rate of the view's gain and offset per channel; 0 holds them.
     pub lr_exposure: f32,
+    /// Adam rate of the network that all views' gains and offsets share, see `appearance`; 0 holds it.
+    pub lr_appearance: f32,
     /// Of the terms beside the photometric loss.
     pub weights: LossWeights,
     /// What the depth loss compares.

@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 
+use crate::appearance::AppearanceNetwork;
 use crate::cpu::adam::Optimiser;
 use crate::cpu::exposure::Exposure;
 use crate::cpu::pass::Pass;
@@ -24,6 +25,8 @@ pub struct CpuEngine {
     pub(crate) optimiser: Optimiser,
     pub(crate) views: Vec<View>,
     pub(crate) pose_network: Option<PoseNetwork>,
+    /// Once a step has moved it.
+    pub(crate) appearance: Option<AppearanceNetwork>,
     pub(crate) log_focal: f64,
     focal_adam: FewAdam<1>,
     pub(crate) pass: Pass,
@@ -92,7 +95,7 @@ impl CpuEngine {
             .n_trained
             .wrapping_add(u32::from(settings.train_splats));
         let view = self.views[view_ix].seen(self.pose_network.as_ref(), self.log_focal.exp());
-        let exposure = self.views[view_ix].exposure;
+        let exposure = self.views[view_ix].exposure(self.appearance.as_ref());
         let value = self
             .pass
             .differentiate(&self.splats, &view, exposure, settings);
@@ -107,6 +110,12 @@ impl CpuEngine {
         if settings.lr_exposure > 0.0 {
             let view = &mut self.views[view_ix];
             let is_updated = view.step_exposure(value.exposure, settings.lr_exposure);
+            n_skipped += usize::from(!is_updated);
+        }
+        if settings.lr_appearance > 0.0 {
+            let network = self.appearance.get_or_insert_default();
+            let view = &mut self.views[view_ix];
+            let is_updated = view.step_appearance(network, value.exposure, settings.lr_appearance);
             n_skipped += usize::from(!is_updated);
         }
         if settings.train_splats {

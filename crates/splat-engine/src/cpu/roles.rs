@@ -177,7 +177,9 @@ impl ViewStore for CpuEngine {
     }
 
     fn exposures(&mut self) -> Result<Vec<[[f32; 3]; 2]>, EngineError> {
-        Ok(self.views.iter().map(|view| view.exposure).collect())
+        let appearance = self.appearance.as_ref();
+        let views = self.views.iter();
+        Ok(views.map(|view| view.exposure(appearance)).collect())
     }
 }
 

@@ -4,9 +4,11 @@
 
 use std::sync::Arc;
 
+use crate::appearance::{AppearanceEmbedding, AppearanceNetwork, first_appearance};
 use crate::cpu::exposure::{Exposure, ExposureAdam};
 use crate::cpu::pose_adam::PoseAdam;
-use crate::pose_network::{Embedding, Moments, PoseNetwork, first_embedding};
+use crate::mlp::Moments;
+use crate::pose_network::{Embedding, PoseNetwork, first_embedding};
 use crate::settings::{FirstEmbedding, StepSettings};
 use crate::view::{Correspondence, TrainingView};
 use splat_types::image::RgbImage;
@@ -20,8 +22,10 @@ pub(crate) struct View {
     moments: Moments,
     adam: PoseAdam,
     pub(crate) matches: Vec<Correspondence>,
-    pub(crate) exposure: Exposure,
+    exposure: Exposure,
     exposure_adam: ExposureAdam,
+    appearance: AppearanceEmbedding,
+    appearance_moments: Moments,
 }
 
 impl View {
@@ -35,6 +39,8 @@ impl View {
             matches: Vec::new(),
             exposure: Exposure::default(),
             exposure_adam: ExposureAdam::default(),
+            appearance: first_appearance(ix),
+            appearance_moments: Moments::default(),
         };
         new.training.assert_consistent();
         new.set_pose(new.training.cam_from_world, pose_network);
@@ -107,7 +113,29 @@ impl View {
         pose_network.update(&mut self.embedding, &mut self.moments, &gradient, rate)
     }
 
-    /// One update of gain and offset. false: the gradient is not finite, nothing changed.
+    /// Gain and offset: the view's own and the network's together.
+    pub(crate) fn exposure(&self, appearance: Option<&AppearanceNetwork>) -> Exposure {
+        let Some(appearance) = appearance else {
+            return self.exposure;
+        };
+        let shared = appearance.exposure(&self.appearance);
+        std::array::from_fn(|kind| {
+            std::array::from_fn(|i| self.exposure[kind][i] + shared[kind][i])
+        })
+    }
+
+    /// One update of the appearance network and of the view's embedding. false: the gradient is not finite, nothing changed.
+    pub(crate) fn step_appearance(
+        &mut self,
+        appearance: &mut AppearanceNetwork,
+        gradient: [[f64; 3]; 2],
+        rate: f32,
+    ) -> bool {
+        let moments = &mut self.appearance_moments;
+        appearance.update(&mut self.appearance, moments, gradient, rate)
+    }
+
+    /// One update of the view's own gain and offset. false: the gradient is not finite, nothing changed.
     pub(crate) fn step_exposure(&mut self, gradient: [[f64; 3]; 2], rate: f32) -> bool {
         let exposure = self.exposure_adam.update(self.exposure, gradient, rate);
         self.exposure = exposure.unwrap_or(self.exposure);

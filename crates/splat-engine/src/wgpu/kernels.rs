@@ -4,6 +4,7 @@ splat_gpu::kernels! {
     folder "../../shaders/";
     libraries [
         "adam",
+        "appearance",
         "blend",
         "camera",
         "cleared",
@@ -12,6 +13,8 @@ splat_gpu::kernels! {
         "groups",
         "lane_sum_shared",
         "lane_sum_subgroup",
+        "mlp",
+        "mlp_update",
         "moves",
         "pose_network",
         "projected",

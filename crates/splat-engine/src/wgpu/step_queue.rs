@@ -6,8 +6,8 @@ use crate::view::SSIM_REACH;
 use crate::wgpu::engine::WgpuEngine;
 use crate::wgpu::passes;
 use crate::wgpu::types::{
-    Camera, FLAG_ALL_SPLATS, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK, FLAG_POSE_SHARED,
-    FLAG_SCREEN_GRADIENTS, FLAG_TRAIN_SPLATS, Step, TILE_PX,
+    Camera, FLAG_ALL_SPLATS, FLAG_APPEARANCE, FLAG_DEPTH, FLAG_POSE_DIRECT, FLAG_POSE_NETWORK,
+    FLAG_POSE_SHARED, FLAG_SCREEN_GRADIENTS, FLAG_TRAIN_SPLATS, Step, TILE_PX,
 };
 use splat_gpu::commands::Commands;
 use splat_gpu::error::GpuError;
@@ -69,6 +69,9 @@ impl WgpuEngine {
         let image = &view.training.image;
         let size = [image.width_px, image.height_px];
         self.frame.fit(&self.gpu, self.memory.n, size)?;
+        if settings.lr_appearance > 0.0 {
+            self.views.start_appearance(&self.gpu);
+        }
         let view = &self.views.all[view_ix];
         let mut step = self.step_of(view_ix, settings, number);
         self.add_epipolar(view_ix, settings, &mut step)?;
@@ -153,6 +156,7 @@ impl WgpuEngine {
             | flag(has_depth, FLAG_DEPTH)
             | flag(s.accumulate_screen_gradients, FLAG_SCREEN_GRADIENTS)
             | flag(self.views.pose_network.is_some(), FLAG_POSE_NETWORK)
+            | flag(self.views.has_appearance, FLAG_APPEARANCE)
             | flag(s.train_splats && s.all_splats, FLAG_ALL_SPLATS);
         Step {
             view_ix: view_ix as u32,
@@ -178,6 +182,7 @@ impl WgpuEngine {
             lr_pose_network: s.lr_pose_network,
             lr_focal: s.lr_focal,
             lr_exposure: s.lr_exposure,
+            lr_appearance: s.lr_appearance,
             noise: s.noise,
             noise_seed: s.noise_seed,
             ssim_weight: s.ssim_weight,

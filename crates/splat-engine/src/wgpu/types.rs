@@ -36,6 +36,7 @@ pub struct Step {
     pub lr_pose_network: f32,
     pub lr_focal: f32,
     pub lr_exposure: f32,
+    pub lr_appearance: f32,
     pub noise: f32,
     pub noise_seed: u32,
     pub ssim_weight: f32,
@@ -63,6 +64,7 @@ pub const FLAG_DEPTH: u32 = 16;
 pub const FLAG_POSE_NETWORK: u32 = 32;
 pub const FLAG_ALL_SPLATS: u32 = 64;
 pub const FLAG_SCREEN_GRADIENTS: u32 = 128;
+pub const FLAG_APPEARANCE: u32 = 256;
 
 /// `Camera` of `shaders/lib/camera.wgsl`. Many fields: names of that struct.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
@@ -140,9 +142,11 @@ pub const VIEW_POSE_M: usize = 18;
 pub const VIEW_POSE_AGE: usize = 30;
 pub const VIEW_EMBEDDING_AGE: usize = 56;
 pub const VIEW_EMBEDDING: usize = 64;
-pub const VIEW_STRIDE: usize = 256;
+pub const VIEW_APPEARANCE: usize = 256;
+pub const VIEW_STRIDE: usize = 320;
 
-/// Places in the shared network's buffer, in f32.
+/// Places in the buffer of the shared networks, in f32.
 pub const NET_SIZE: usize = 8905;
 pub const LOG_FOCAL: usize = 26716;
-pub const NET_FLOATS: usize = 26720;
+pub const APPEARANCE_NET: usize = 26720;
+pub const NET_FLOATS: usize = 43635;

@@ -4,12 +4,14 @@ use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3};
 
+use crate::appearance::{AppearanceMlp, AppearanceNetwork, first_appearance};
 use crate::pose_network::{Embedding, PoseNetwork, WIDTH, first_embedding};
 use crate::settings::{FirstEmbedding, PoseNetworkSettings};
 use crate::view::{Correspondence, SSIM_REACH, TrainingView};
 use crate::wgpu::types::{
-    LOG_FOCAL, NET_FLOATS, NET_SIZE, VIEW_EMBEDDING, VIEW_EMBEDDING_AGE, VIEW_EXPOSURE,
-    VIEW_PINHOLE, VIEW_POSE_AGE, VIEW_POSE_M, VIEW_QUAT, VIEW_STRIDE, VIEW_TRANSLATION,
+    APPEARANCE_NET, LOG_FOCAL, NET_FLOATS, NET_SIZE, VIEW_APPEARANCE, VIEW_EMBEDDING,
+    VIEW_EMBEDDING_AGE, VIEW_EXPOSURE, VIEW_PINHOLE, VIEW_POSE_AGE, VIEW_POSE_M, VIEW_QUAT,
+    VIEW_STRIDE, VIEW_TRANSLATION,
 };
 use splat_gpu::buffer::Buffer;
 use splat_gpu::commands::Commands;
@@ -33,6 +35,8 @@ pub(crate) struct Views {
     pub(crate) network: Buffer,
     /// Settings of the network once it has started.
     pub(crate) pose_network: Option<PoseNetworkSettings>,
+    /// Whether a step has moved the appearance network.
+    pub(crate) has_appearance: bool,
 }
 
 /// What the host has to know of a view.
@@ -57,6 +61,7 @@ impl Views {
             capacity: MIN_VIEWS,
             network: gpu.storage::<f32>("network", NET_FLOATS)?,
             pose_network: None,
+            has_appearance: false,
         })
     }
 
@@ -78,6 +83,8 @@ impl Views {
             .pose_network
             .map_or(FirstEmbedding::default(), |network| network.embedding);
         gpu.write(&self.records, embedding, &first_embedding(kind, ix));
+        let appearance = ix * VIEW_STRIDE + VIEW_APPEARANCE;
+        gpu.write(&self.records, appearance, &first_appearance(ix));
         self.write_camera(gpu, ix, &view.training.intrinsics);
         self.all.push(view);
         self.set_pose(gpu, ix, pose)?;
@@ -163,7 +170,7 @@ impl Views {
         settings: &PoseNetworkSettings,
     ) -> Result<(), GpuError> {
         let poses = self.poses(gpu)?;
-        let mut parameters = PoseNetwork::new(settings).parameters;
+        let mut parameters = PoseNetwork::new(settings).mlp.parameters;
         // Moments and age; the focal factor behind them stays.
         parameters.resize(3 * NET_SIZE + 1, 0.0);
         gpu.write(&self.network, 0, &parameters);
@@ -186,12 +193,31 @@ impl Views {
 
     pub(crate) fn exposures(&self, gpu: &Gpu) -> Result<Vec<[[f32; 3]; 2]>, GpuError> {
         let records: Vec<f32> = gpu.read(&self.records, 0..self.all.len() * VIEW_STRIDE)?;
+        let mut network = AppearanceNetwork::default();
+        if self.has_appearance {
+            let at = APPEARANCE_NET;
+            let n = AppearanceMlp::N_PARAMETERS;
+            network.mlp.parameters = gpu.read(&self.network, at..at + n)?;
+        }
         let exposure = |record: &[f32]| {
-            std::array::from_fn(|kind| {
-                std::array::from_fn(|channel| record[VIEW_EXPOSURE + 3 * kind + channel])
-            })
+            let embedding = std::array::from_fn(|i| record[VIEW_APPEARANCE + i]);
+            let mut exposure = network.exposure(&embedding);
+            let own = &record[VIEW_EXPOSURE..VIEW_EXPOSURE + 6];
+            for (value, own) in exposure.as_flattened_mut().iter_mut().zip(own) {
+                *value += own;
+            }
+            exposure
         };
         Ok(records.chunks_exact(VIEW_STRIDE).map(exposure).collect())
+    }
+
+    /// What a step needs that moves the appearance network.
+    pub(crate) fn start_appearance(&mut self, gpu: &Gpu) {
+        if !self.has_appearance {
+            let parameters = AppearanceNetwork::default().mlp.parameters;
+            gpu.write(&self.network, APPEARANCE_NET, &parameters);
+            self.has_appearance = true;
+        }
     }
 
     /// The network as it is, when it has started.
@@ -200,7 +226,7 @@ impl Views {
             return Ok(None);
         };
         let mut pose_network = PoseNetwork::new(settings);
-        pose_network.parameters = gpu.read(&self.network, 0..NET_SIZE)?;
+        pose_network.mlp.parameters = gpu.read(&self.network, 0..NET_SIZE)?;
         Ok(Some(pose_network))
     }
 

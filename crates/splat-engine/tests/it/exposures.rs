@@ -201,6 +201,7 @@ fn hostile_scenes_stay_finite_with_every_mode_on() {
                         ..random::settings().weights
                     },
                     lr_exposure: 0.5,
+                    lr_appearance: 0.1,
                     noise: 1000.0,
                     noise_seed: seed as u32,
                     sh_interval: 2,

@@ -5,6 +5,7 @@
 )]
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
 
+mod appearance;
 mod backends;
 mod densify;
 mod engine;

@@ -140,7 +140,7 @@ fn every_backend_follows_the_optimisation_of_the_paper_in_f64() {
     for backend in &BACKENDS {
         let (scene, views) = scene();
         let start = Params::from(&scene.splats);
-        let network = PoseNetwork::new(&NETWORK).parameters;
+        let network = PoseNetwork::new(&NETWORK).mlp.parameters;
         let scale = f64::from(NETWORK.camera_scale);
         let mut wanted = PaperRun::new(start.clone(), views.clone(), &network, scale);
         let mut engine = (backend.engine)();

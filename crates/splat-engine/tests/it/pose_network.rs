@@ -6,7 +6,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::reference::pose_network::{Network, output_gradient};
-use splat_engine::pose_network::{Embedding, Moments, N_PARAMETERS, PoseNetwork, W3, WIDTH};
+use splat_engine::mlp::Moments;
+use splat_engine::pose_network::{Embedding, PoseMlp, PoseNetwork, WIDTH};
 use splat_engine::settings::{FirstEmbedding, PoseNetworkSettings};
 use splat_types::transform::Rigid;
 
@@ -23,7 +24,7 @@ fn random_network(seed: u64) -> (PoseNetwork, Embedding) {
         camera_scale: 0.7,
     };
     let mut pose_network = PoseNetwork::new(&settings);
-    for value in &mut pose_network.parameters[W3.start..] {
+    for value in &mut pose_network.mlp.parameters[PoseMlp::W3.start..] {
         *value = rng.random_range(-0.1..0.1);
     }
     (
@@ -107,6 +108,7 @@ fn the_references_output_gradient_agrees_with_differences() {
 fn the_references_whole_chain_agrees_with_differences() {
     let (pose_network, embedding) = random_network(3);
     let flat: Vec<f64> = pose_network
+        .mlp
         .parameters
         .iter()
         .copied()
@@ -136,7 +138,10 @@ fn the_references_whole_chain_agrees_with_differences() {
             assert_close(&name, found, wanted, scale, REFERENCE_TOLERANCE);
         };
     // Every seventh reaches all rows and columns of all layers; each costs two passes.
-    for k in (0..N_PARAMETERS).step_by(7).chain(W3.start..N_PARAMETERS) {
+    for k in (0..PoseMlp::N_PARAMETERS)
+        .step_by(7)
+        .chain(PoseMlp::W3.start..PoseMlp::N_PARAMETERS)
+    {
         let at = |delta: f64| {
             let mut flat = flat.clone();
             flat[k] += delta;
@@ -172,6 +177,7 @@ fn forward_and_backward_agree_with_the_reference() {
     for seed in 0..20 {
         let (pose_network, embedding) = random_network(seed);
         let flat: Vec<f64> = pose_network
+            .mlp
             .parameters
             .iter()
             .copied()
@@ -191,7 +197,7 @@ fn forward_and_backward_agree_with_the_reference() {
         let (g_flat, g_embedding) = network.backward(&reference_embedding, g_pose);
         for (found, wanted) in [
             (&found.parameters[..], &g_flat),
-            (&found.embedding[..], &g_embedding),
+            (&found.input[..], &g_embedding),
         ] {
             let error: f64 = found.iter().zip(wanted).map(|(a, b)| (a - b).powi(2)).sum();
             let norm: f64 = wanted.iter().map(|v| v * v).sum();
@@ -216,8 +222,12 @@ fn a_fresh_network_moves_nothing_and_its_first_step_moves_all_alike() {
         &pose_network.forward(&embedding),
         [1.0, 0.0, 0.0, 0.0, 2.0, 0.0],
     );
-    assert!(gradient.embedding.iter().all(|g| *g == 0.0));
-    assert!(gradient.parameters[..W3.start].iter().all(|g| *g == 0.0));
+    assert!(gradient.input.iter().all(|g| *g == 0.0));
+    assert!(
+        gradient.parameters[..PoseMlp::W3.start]
+            .iter()
+            .all(|g| *g == 0.0)
+    );
     let mut moments = Moments::default();
     assert!(pose_network.update(&mut embedding, &mut moments, &gradient, 1e-3));
     assert_eq!(embedding, [0.0; WIDTH]);

@@ -198,6 +198,9 @@ pub struct TrainParams {
     /// Adam rate of each view's gain and offset of r, g, b; 0 = none.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub lr_exposure: f32,
+    /// Adam rate of the network that gives the views' gains and offsets together, from an embedding per view; 0 = none.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub lr_appearance: f32,
 }
 
 impl Default for TrainParams {
@@ -248,6 +251,7 @@ impl Default for TrainParams {
             pose_embedding: PoseEmbedding::Order,
             lr_focal: 0.0,
             lr_exposure: 0.0,
+            lr_appearance: 0.0,
         }
     }
 }

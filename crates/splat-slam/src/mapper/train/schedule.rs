@@ -201,6 +201,7 @@ pub fn settings(
         lr_pose_network: decayed(params.train.lr_pose_network, final_pose),
         lr_focal: decayed(params.train.lr_focal, final_pose),
         lr_exposure: params.train.lr_exposure,
+        lr_appearance: params.train.lr_appearance,
         ssim_weight: params.train.ssim_weight,
         weights,
         depth_mode: match params.train.depth_mode {
