@@ -267,7 +267,7 @@ fn steps_on_every_backend_follow_the_plain_pass() {
     }
 }
 
-/// Two views of one place, one taken darker: the network tells them apart, without exposures of their own.
+/// Two views of one place, one taken darker: the network separates them, without exposures of their own.
 #[test]
 fn the_network_learns_that_a_view_is_darker() {
     for backend in &BACKENDS {

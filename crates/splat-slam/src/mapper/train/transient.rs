@@ -179,7 +179,7 @@ mod tests {
         assert!(weights(|_, _| false, 0.95).is_none(), "noise is no thing");
     }
 
-    /// Of a picture with light and dark, taken darker than it is drawn, with a bright square in it or without.
+    /// Of an image with light and dark parts, taken darker than it is drawn, with a bright square in it or without.
     fn weights_of_a_darker_image(has_square: bool) -> Option<Arc<[u8]>> {
         let n = SIDE * SIDE;
         let shade = |p: usize| 0.2 + 0.6 * ((p % SIDE) as f32 / SIDE as f32);
