@@ -89,4 +89,5 @@ mod tracking_node;
 mod trajectory;
 mod type_hashes;
 mod visual_odometry;
+mod written_scenes;
 mod xfeat;

@@ -13,7 +13,7 @@ use splat_mapper::eval::trajectory::read_tum;
 const ROOM: &str = "synthetic:room?frames=24&width=192&height=144&speed=3";
 const DEMO: &str = "recordings/demo.mcap";
 
-fn program(args: &[&str]) -> Command {
+pub(crate) fn program(args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splat-mapper"));
     command.args(args);
     command
@@ -32,7 +32,7 @@ fn report(out: &Path) -> Value {
 }
 
 /// The last line of stderr is what a person reads first.
-fn last_line(output: &Output) -> String {
+pub(crate) fn last_line(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr)
         .lines()
         .last()

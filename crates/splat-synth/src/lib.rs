@@ -62,4 +62,6 @@ mod odometry;
 
 pub mod record;
 
+pub mod layouts;
+
 pub mod source;

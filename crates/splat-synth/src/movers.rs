@@ -28,6 +28,11 @@ pub(crate) struct Mover {
     colours: [Vec3; 2],
 }
 
+/// Whether none is in image `ix`, however many there are in others.
+pub(crate) fn is_clean(ix: u32) -> bool {
+    ix % CLEAN_EVERY == CLEAN
+}
+
 /// Those of image `ix`.
 pub(crate) fn movers(
     scene: &Scene,
@@ -35,7 +40,7 @@ pub(crate) fn movers(
     (pose, ix): (Rigid, u32),
     (n, seed): (u32, u64),
 ) -> Vec<Mover> {
-    if ix % CLEAN_EVERY == CLEAN {
+    if is_clean(ix) {
         return Vec::new();
     }
     let size = DVec2::new(

@@ -15,3 +15,5 @@ mod image_files;
 mod transforms;
 
 pub mod scene;
+
+pub mod written;
