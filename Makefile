@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint zenoh-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
+.PHONY: demo test lint zenoh-test formats-test layouts-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -24,6 +24,15 @@ lint:
 # What goes out, read, asked and harassed over zenoh by clients from PyPI.
 zenoh-test:
 	scripts/zenoh_test
+
+# Maps and scenes that `export` writes, read by splat-transform, Khronos's glTF validator and pycolmap.
+formats-test:
+	scripts/formats_test
+
+# Scenes of 100 images at 1,600 x 1,200 px in every layout of images and poses, mapped with the paper's settings; LAYOUTS="colmap" for some of them.
+layouts-test:
+	cargo build --release --locked
+	scripts/layouts_test $(LAYOUTS)
 
 # Cameras: boots a kernel with synthetic ones in QEMU and holds docs/CAMERAS.md against them. Says so where it is skipped.
 v4l2-test:

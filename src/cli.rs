@@ -159,9 +159,12 @@ fn seconds(text: &str) -> Result<f64, String> {
 struct SynthArgs {
     /// room, facade, corridor or hallway
     scene: String,
-    /// Recording to write; its poses go beside it as .tum
-    #[arg(long, value_name = "FILE.mcap")]
+    /// Recording to write, FILE.mcap; its poses go beside it as .tum. With --layout a new folder
+    #[arg(long, value_name = "PATH")]
     out: PathBuf,
+    /// A folder of images and poses instead of a recording: colmap, nerfstudio, blender or robustnerf
+    #[arg(long)]
+    layout: Option<String>,
     #[arg(long)]
     frames: Option<u32>,
     /// Pixels
@@ -268,10 +271,16 @@ struct RenderArgs {
 
 #[derive(Debug, Args)]
 struct ExportArgs {
-    /// map.splatmap or map.ply
+    /// map.splatmap, or a .ply or .spz of any program
     map: PathBuf,
-    /// OUT.ply
+    /// OUT.ply, .compressed.ply, .spz, .glb or .splat; or DIR/ for a scene of images and poses
     out: PathBuf,
+    /// Of a scene: colmap or nerfstudio
+    #[arg(long)]
+    layout: Option<String>,
+    /// Of an .spz: 3, which web viewers read, or 4
+    #[arg(long, value_name = "3|4", default_value_t = 3)]
+    spz_version: u32,
 }
 
 #[derive(Debug, Subcommand)]

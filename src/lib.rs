@@ -13,6 +13,8 @@ pub mod report;
 
 pub mod params;
 
+pub mod formats;
+
 pub mod node;
 
 pub mod compare;

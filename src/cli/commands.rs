@@ -16,15 +16,18 @@ use crate::doctor::check::State;
 use crate::doctor::checks;
 use crate::doctor::model_check::Report;
 use crate::eval::{evaluation, render, trajectory};
+use crate::formats::file::{self, SplatFormat};
+use crate::formats::scene::{self, SceneLayout};
+use crate::formats::spz::SpzVersion;
 use crate::node::engines::Engines;
 use crate::node::run_dir;
 use crate::node::save_map::{MapFile, save_map};
 use splat_geometry::foundation::model::Model;
 use splat_gpu::backend::Backend;
 use splat_slam::mapper::map_file::checkpoint;
+use splat_synth::layouts::{FolderLayout, write_folder};
 use splat_synth::record::write_recording;
 use splat_synth::settings::SynthSettings;
-use splat_types::splats::ply;
 use splat_types::splats::splats::Splats;
 
 pub(crate) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
@@ -48,6 +51,9 @@ pub(crate) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
             .ok_or_else(|| Usage(format!("--set {option} is not key=value")))?;
         settings.set(key, value)?;
     }
+    if let Some(name) = &args.layout {
+        return synth_folder(&settings, name, &args.out);
+    }
     let summary = write_recording(&settings, &args.out)?;
     say(format!(
         "{} frames, {} messages, {:.1} MB: {}",
@@ -55,6 +61,21 @@ pub(crate) fn synth(args: &SynthArgs) -> anyhow::Result<ExitCode> {
         summary.n_messages,
         summary.bytes as f64 * 1e-6,
         args.out.display()
+    ));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn synth_folder(settings: &SynthSettings, name: &str, out: &Path) -> anyhow::Result<ExitCode> {
+    let known = FolderLayout::NAMES.iter().find(|(known, _)| *known == name);
+    let Some((_, layout)) = known else {
+        let names = FolderLayout::NAMES.map(|(name, _)| name).join(", ");
+        return Err(Usage(format!("--layout {name} is none of {names}")).into());
+    };
+    write_folder(settings, *layout, out, |_| {})?;
+    say(format!(
+        "{} images in the layout of {name}: {}",
+        settings.n_frames,
+        out.display()
     ));
     Ok(ExitCode::SUCCESS)
 }
@@ -139,16 +160,38 @@ pub(crate) fn render(args: &RenderArgs) -> anyhow::Result<ExitCode> {
 }
 
 pub(crate) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
-    let splats = read_map(&args.map)?;
-    match args.out.extension().and_then(|e| e.to_str()) {
-        Some("ply") => save_map(MapFile::Ply(&splats), &args.out)?,
-        other => bail!(
-            "this build exports .ply, not {:?}: {}",
-            other.unwrap_or(""),
-            args.out.display()
-        ),
+    let is_folder = args.layout.is_some() || args.out.to_string_lossy().ends_with('/');
+    if is_folder {
+        return export_scene(args);
     }
+    let splats = read_map(&args.map)?;
+    let spz = match args.spz_version {
+        3 => SpzVersion::V3,
+        4 => SpzVersion::V4,
+        other => return Err(Usage(format!("--spz-version {other} is neither 3 nor 4")).into()),
+    };
+    let Some(format) = SplatFormat::of(&args.out, spz) else {
+        return Err(Usage(file::unknown_ending(&args.out)).into());
+    };
+    save_map(MapFile::As(format, &splats), &args.out)?;
     say(format!("{} splats: {}", splats.len(), args.out.display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn export_scene(args: &ExportArgs) -> anyhow::Result<ExitCode> {
+    let name = args.layout.as_deref().unwrap_or("colmap");
+    let known = SceneLayout::NAMES.iter().find(|(known, _)| *known == name);
+    let Some((_, layout)) = known else {
+        let names = SceneLayout::NAMES.map(|(name, _)| name).join(", ");
+        return Err(Usage(format!("--layout {name} is none of {names}")).into());
+    };
+    let map = checkpoint::read(&args.map)?;
+    let n = scene::write(&map, *layout, &args.out)?;
+    let left_out = map.snapshot.poses.len().saturating_sub(n);
+    say(format!(
+        "{n} images in the layout of {name}, {left_out} keyframes without an image left out: {}",
+        args.out.display()
+    ));
     Ok(ExitCode::SUCCESS)
 }
 
@@ -186,13 +229,13 @@ pub(crate) fn doctor() -> ExitCode {
 
 fn read_map(path: &Path) -> anyhow::Result<Splats> {
     match path.extension().and_then(|e| e.to_str()) {
-        Some("ply") => Ok(ply::read(path)?),
+        Some("ply" | "spz") => Ok(file::read(path)?),
         Some("splatmap") => {
             let checkpoint = checkpoint::read(path)?;
             Ok(std::sync::Arc::unwrap_or_clone(checkpoint.snapshot.splats))
         }
         _ => Err(Usage(format!(
-            "a map is a .splatmap or .ply file: {}",
+            "a map is a .splatmap, .ply or .spz file: {}",
             path.display()
         )))
         .context("cannot read the map"),

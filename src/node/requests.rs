@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::sync::mpsc::Receiver as Calls;
 
+use crate::formats::file::{self, SplatFormat};
+use crate::formats::spz::SpzVersion;
 use crate::node::save_map::{MapFile, save_map};
 use crate::node::stop::Stop;
 use splat_engine::error::EngineError;
@@ -84,11 +86,13 @@ impl RequestHandler {
             ServiceRequest::Save(path) => done("the map was saved", self.save(map, path)?),
             ServiceRequest::Export(path) => {
                 let snapshot = map.snapshot()?;
-                let written = save_map(MapFile::Ply(&snapshot.splats), path);
-                done(
-                    "the splats were written",
-                    written.map_err(|e| e.to_string()),
-                )
+                let format = SplatFormat::of(path, SpzVersion::V3);
+                let format = format.ok_or_else(|| file::unknown_ending(path));
+                let written = format.and_then(|format| {
+                    let written = save_map(MapFile::As(format, &snapshot.splats), path);
+                    written.map_err(|e| e.to_string())
+                });
+                done("the splats were written", written)
             }
             ServiceRequest::Load(path) => match self.load(path) {
                 Ok(()) => ServiceReply::Done("mapping goes on from the saved map".to_owned()),

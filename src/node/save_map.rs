@@ -5,9 +5,10 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::formats::file::{self, SplatFormat};
 use splat_io::whole_file::write_file;
 use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint, CheckpointError};
-use splat_types::splats::ply::{self, ExportError};
+use splat_types::splats::ply::ExportError;
 use splat_types::splats::splats::Splats;
 
 /// What is written, and in which form.
@@ -17,6 +18,8 @@ pub enum MapFile<'a> {
     Checkpoint(&'a Checkpoint),
     /// `.ply`
     Ply(&'a Splats),
+    /// Any format of splats.
+    As(SplatFormat, &'a Splats),
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -49,14 +52,17 @@ pub fn save_map(file: MapFile<'_>, path: &Path) -> Result<(), SaveError> {
                 }
             })?;
         }
-        MapFile::Ply(splats) => {
-            write_file(path, |file| ply::write(splats, file)).map_err(|e| ExportError::Write {
-                reason: e.to_string(),
-                path: path.to_owned(),
-            })?;
-        }
+        MapFile::Ply(splats) => write_splats(SplatFormat::Ply, splats, path)?,
+        MapFile::As(format, splats) => write_splats(format, splats, path)?,
     }
     Ok(())
+}
+
+fn write_splats(format: SplatFormat, splats: &Splats, path: &Path) -> Result<(), ExportError> {
+    write_file(path, |file| format.write(splats, file)).map_err(|e| ExportError::Write {
+        reason: e.to_string(),
+        path: path.to_owned(),
+    })
 }
 
 impl MapFile<'_> {
@@ -65,7 +71,7 @@ impl MapFile<'_> {
             Self::Checkpoint(map) => {
                 !map.snapshot.splats.is_empty() || map.evicted.iter().any(|e| e.n_splats > 0)
             }
-            Self::Ply(splats) => !splats.is_empty(),
+            Self::Ply(splats) | Self::As(_, splats) => !splats.is_empty(),
         }
     }
 
@@ -75,7 +81,7 @@ impl MapFile<'_> {
             Self::Checkpoint(_) => {
                 checkpoint::read(path).is_ok_and(|map| map.snapshot.splats.is_empty())
             }
-            Self::Ply(_) => ply::read(path).is_ok_and(|splats| splats.is_empty()),
+            Self::Ply(_) | Self::As(..) => file::read(path).is_ok_and(|splats| splats.is_empty()),
         }
     }
 }

@@ -329,6 +329,8 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
                 "crates/splat-slam/src/track/landmark_file",
             ][..],
         ),
+        ("flate2", &["src/formats/spz.rs"][..]),
+        ("zstd", &["src/formats/spz.rs"][..]),
         ("maud", &["src/report/"][..]),
         ("clap", &["src/cli"][..]),
         ("indicatif", &["src/cli"][..]),

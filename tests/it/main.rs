@@ -19,6 +19,7 @@ mod deltas;
 mod device_loss;
 mod eval;
 mod eval_lines;
+mod exports;
 mod exposure;
 mod formats;
 mod gpu_runs;

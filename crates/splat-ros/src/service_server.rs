@@ -26,7 +26,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// Questions that may wait for the map's thread.
 const MAX_CALLS: usize = 8;
 /// Forms that `export` writes.
-const EXPORTS: &[&str] = &["ply"];
+const EXPORTS: &[&str] = &["ply", "spz", "glb", "splat"];
 /// Chunks of one answer: below the bound on messages at the largest chunk.
 const MAX_CHUNKS: u32 = 3;
 

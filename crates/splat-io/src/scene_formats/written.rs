@@ -4,7 +4,7 @@
 
 use std::fmt::Write as _;
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Map, Value, json};
 
 use splat_types::camera::{CameraModel, Distortion};
@@ -26,11 +26,14 @@ pub struct WrittenView {
 /// Name of a file below the scene's folder, and what is in it.
 pub type WrittenFile = (&'static str, String);
 
-/// `cameras.txt`, `images.txt` and `points3D.txt` of `sparse/0`. Views of one lens share a camera. Points are seen by `image` of each, from 0 on.
+/// `cameras.txt`, `images.txt` and `points3D.txt` of `sparse/0`. Views of one lens share a camera. Each point has the one observation of its image (its
+/// number, from 0 on), where it lies within that image, and none else.
 pub fn colmap(views: &[WrittenView], points: &[(SparsePoint, usize)]) -> Vec<WrittenFile> {
     let mut lenses: Vec<CameraModel> = Vec::new();
-    let mut images =
-        String::from("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points (none)\n");
+    let mut images = String::from(
+        "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of each observation\n",
+    );
+    let (observations, tracks) = colmap_observations(views, points);
     for (id, view) in (1..).zip(views) {
         let known = lenses.iter().position(|lens| *lens == view.lens);
         let camera = known.unwrap_or_else(|| {
@@ -41,10 +44,8 @@ pub fn colmap(views: &[WrittenView], points: &[(SparsePoint, usize)]) -> Vec<Wri
         let (q, t) = (pose.rotation, pose.translation);
         let numbers = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string());
         let (numbers, name) = (numbers.join(" "), &view.name);
-        line(
-            &mut images,
-            format_args!("{id} {numbers} {camera} {name}\n"),
-        );
+        line(&mut images, format_args!("{id} {numbers} {camera} {name}"));
+        line(&mut images, format_args!("{}", observations[id - 1]));
     }
     let mut cameras = String::from("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n");
     for (id, lens) in (1..).zip(&lenses) {
@@ -60,12 +61,11 @@ pub fn colmap(views: &[WrittenView], points: &[(SparsePoint, usize)]) -> Vec<Wri
     }
     let mut cloud =
         String::from("# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
-    for (id, (point, image)) in (1..).zip(points) {
-        let (p, [r, g, b]) = (point.position_in_gt, point.rgb);
-        let (error, image) = (point.error_px, image + 1);
+    for ((id, (point, _)), track) in (1..).zip(points).zip(tracks) {
+        let (p, [r, g, b], error) = (point.position_in_gt, point.rgb, point.error_px);
         line(
             &mut cloud,
-            format_args!("{id} {} {} {} {r} {g} {b} {error} {image} 0", p.x, p.y, p.z),
+            format_args!("{id} {} {} {} {r} {g} {b} {error} {track}", p.x, p.y, p.z),
         );
     }
     vec![
@@ -73,6 +73,37 @@ pub fn colmap(views: &[WrittenView], points: &[(SparsePoint, usize)]) -> Vec<Wri
         ("sparse/0/images.txt", images),
         ("sparse/0/points3D.txt", cloud),
     ]
+}
+
+/// The observations of each view as `images.txt` lists them, and the track of each point.
+fn colmap_observations(
+    views: &[WrittenView],
+    points: &[(SparsePoint, usize)],
+) -> (Vec<String>, Vec<String>) {
+    let mut lines = vec![Vec::new(); views.len()];
+    let mut tracks = Vec::with_capacity(points.len());
+    for (id, (point, image)) in (1_usize..).zip(points) {
+        let pixel = views.get(*image).and_then(|view| {
+            let in_cam = view
+                .world_from_cam
+                .inverse()
+                .transform_point(point.position_in_gt);
+            let i = view.lens.intrinsics;
+            let pixel = view.lens.project(in_cam)?;
+            let size = DVec2::new(f64::from(i.width_px), f64::from(i.height_px));
+            (pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all()).then_some(pixel)
+        });
+        let Some(pixel) = pixel else {
+            tracks.push(String::new());
+            continue;
+        };
+        tracks.push(format!("{} {}", image + 1, lines[*image].len()));
+        lines[*image].push(format!("{:.3} {:.3} {id}", pixel.x, pixel.y));
+    }
+    (
+        lines.iter().map(|of_view| of_view.join(" ")).collect(),
+        tracks,
+    )
 }
 
 /// `transforms.json`, and `sparse_pc.ply` where there are points. A lens that all views share stands at the top.

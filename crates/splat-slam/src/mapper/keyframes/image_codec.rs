@@ -44,6 +44,15 @@ pub enum Content {
 }
 
 impl SavedView {
+    /// The image that splats were trained on, as a JPEG file.
+    pub fn jpeg(&self) -> io::Result<Vec<u8>> {
+        let packed = self.packed()?;
+        let n = (&packed[..]).read_u32::<LittleEndian>()?;
+        let jpeg = packed[4..].get(..n as usize);
+        let cut_off = || io::Error::new(io::ErrorKind::InvalidData, "it is cut off");
+        Ok(jpeg.ok_or_else(cut_off)?.to_vec())
+    }
+
     /// As files have it.
     pub fn packed(&self) -> io::Result<Vec<u8>> {
         match &self.content {
