@@ -6,12 +6,15 @@ mod commands;
 
 mod recording;
 
+mod view;
+
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::view::viewer;
 use splat_ros::ros2::names::split_arguments;
 
 /// Camera frames in, refined poses and a 3D Gaussian splat map out.
@@ -41,6 +44,8 @@ enum Command {
     Compare(CompareArgs),
     /// Renders a map from given poses
     Render(RenderArgs),
+    /// Shows a saved map in a browser, until Ctrl-C
+    View(ViewArgs),
     /// Converts a map to another format
     Export(ExportArgs),
     /// Looks at models for --geometry onnx:FILE
@@ -75,6 +80,9 @@ struct RunArgs {
     /// map.splatmap of an earlier run to resume
     #[arg(long, visible_alias = "map", value_name = "FILE")]
     resume: Option<PathBuf>,
+    /// Serves a page that shows the map while it grows: ADDRESS:PORT, else 127.0.0.1:8642
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = viewer::DEFAULT_ADDRESS)]
+    view: Option<String>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -111,6 +119,9 @@ struct ReplayArgs {
     /// Keeps every N-th keyframe out of optimisation to measure quality; 0 = off
     #[arg(long, value_name = "N")]
     holdout: Option<u32>,
+    /// Serves a page that shows the map while it grows: ADDRESS:PORT, else 127.0.0.1:8642
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = viewer::DEFAULT_ADDRESS)]
+    view: Option<String>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -128,6 +139,18 @@ struct LocaliseArgs {
     /// Prints JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    params: ParamArgs,
+}
+
+#[derive(Debug, Args)]
+struct ViewArgs {
+    /// map.splatmap, the directory of a run, or a .ply or .spz of any program
+    #[arg(value_name = "MAP|RUN_DIR")]
+    map: String,
+    /// Address of the page; publish.view_* has token and encryption
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    at: Option<String>,
     #[command(flatten)]
     params: ParamArgs,
 }
@@ -318,6 +341,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => commands::eval(&args),
         Command::Compare(args) => commands::compare(&args),
         Command::Render(args) => commands::render(&args),
+        Command::View(args) => view::run(&args),
         Command::Export(args) => commands::export(&args),
         Command::Model(ModelCommand::Check(args)) => commands::model_check(&args),
         Command::Doctor => Ok(commands::doctor()),

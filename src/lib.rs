@@ -17,6 +17,8 @@ pub mod formats;
 
 pub mod node;
 
+pub mod view;
+
 pub mod compare;
 
 pub mod cli;

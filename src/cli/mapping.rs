@@ -16,6 +16,7 @@ use crate::node::stop::Stop;
 use crate::node::{localise, open_source, pipeline, ros2, run_dir};
 use crate::params::error::ParamsError;
 use crate::params::settings::Settings;
+use crate::view::viewer::{self, Shown};
 use splat_types::time::Stopwatch;
 
 /// Between lines of the log about one activity.
@@ -29,6 +30,7 @@ pub(crate) fn run(args: &RunArgs) -> anyhow::Result<ExitCode> {
             .map_err(|e| usage(&e))?;
     }
     resume(&mut settings, args.resume.as_deref())?;
+    set_view(&mut settings, args.view.as_deref())?;
     map(&settings, &args.source, args.out.as_deref())
 }
 
@@ -40,6 +42,16 @@ fn resume(settings: &mut Settings, map: Option<&Path>) -> anyhow::Result<()> {
             .ok_or_else(|| Usage(format!("--resume {} is not UTF-8", map.display())))?;
         settings
             .set("map.resume", path.into())
+            .map_err(|e| usage(&e))?;
+    }
+    Ok(())
+}
+
+/// `--view` is `publish.view`.
+pub(crate) fn set_view(settings: &mut Settings, address: Option<&str>) -> anyhow::Result<()> {
+    if let Some(address) = address {
+        settings
+            .set("publish.view", address.into())
             .map_err(|e| usage(&e))?;
     }
     Ok(())
@@ -75,6 +87,7 @@ pub(crate) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         }
     }
     resume(&mut settings, args.resume.as_deref())?;
+    set_view(&mut settings, args.view.as_deref())?;
     map(&settings, &args.input, args.out.as_deref())
 }
 
@@ -131,7 +144,7 @@ pub(crate) fn settings(args: &ParamArgs) -> anyhow::Result<Settings> {
     Ok(settings)
 }
 
-fn usage(error: &ParamsError) -> Usage {
+pub(crate) fn usage(error: &ParamsError) -> Usage {
     Usage(error.to_string())
 }
 
@@ -152,7 +165,13 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
     let transport = ros2.as_ref().map(ros2::Node::transport).transpose()?;
-    let output = job::output(&params, transport)?;
+    let mut transports: Vec<_> = transport.into_iter().collect();
+    let viewer = viewer::start(&params.publish, Shown::Live, input, true)?;
+    let is_viewed = viewer.is_some();
+    if let Some(viewer) = viewer {
+        transports.push(Box::new(viewer));
+    }
+    let output = job::output(&params, transports)?;
     if let (Some(node), Some(output)) = (&ros2, &output) {
         node.serve(&output.handles.publisher, &stop, params.ros2.autostart)?;
     }
@@ -176,7 +195,12 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     display.clear();
     let (mut outcome, summary) = finished?;
     say(summary);
-    linger(&mut outcome, params.publish.shutdown_delay, &stop);
+    let mut secs = params.publish.shutdown_delay;
+    if is_viewed && is_terminal && !stop.is_asked() {
+        say("The viewer stays until Ctrl-C.");
+        secs = f64::INFINITY;
+    }
+    linger(&mut outcome, secs, &stop);
     verdict(&outcome, input)
 }
 

@@ -227,16 +227,13 @@ pub(crate) fn spawn<T: Send + 'static>(
         .with_context(|| format!("cannot start thread {name}"))
 }
 
-/// The way out that the parameters ask for, if any, and over `transport`.
-pub fn output(
-    params: &Params,
-    transport: Option<Box<dyn Transport>>,
-) -> anyhow::Result<Option<Output>> {
-    let (publish, has_transport) = (&params.publish, transport.is_some());
-    if !(publish.zenoh || has_transport || !publish.record.is_empty()) {
+/// The way out that the parameters ask for, if any, and over `more`.
+pub fn output(params: &Params, more: Vec<Box<dyn Transport>>) -> anyhow::Result<Option<Output>> {
+    let publish = &params.publish;
+    if !(publish.zenoh || !more.is_empty() || !publish.record.is_empty()) {
         return Ok(None);
     }
-    Ok(Some(Output::open(publish, transport)?))
+    Ok(Some(Output::open(publish, more)?))
 }
 
 /// Keeps the way out up for late joiners and services, then closes it; Ctrl-C cuts the wait short.

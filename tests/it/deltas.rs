@@ -57,7 +57,7 @@ fn follow(follower: &mut Follower, pieces: &[SplatDelta]) -> Followed {
 }
 
 /// The next revision: some splats gone, all others moved a little, a few much, and new ones behind.
-fn next(of: &Snapshot, dice: &mut Dice) -> Snapshot {
+pub fn next(of: &Snapshot, dice: &mut Dice) -> Snapshot {
     let mut splats = Splats {
         sh_degree: of.splats.sh_degree,
         ..Splats::default()

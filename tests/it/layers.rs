@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Crates in layer order, each with the crates of ours that it may use.
-const CRATES: [(&str, &[&str]); 10] = [
+const CRATES: [(&str, &[&str]); 11] = [
     ("splat-types", &[]),
     ("splat-gpu", &[]),
     ("splat-image", &["splat-types"]),
@@ -34,6 +34,7 @@ const CRATES: [(&str, &[&str]); 10] = [
         "splat-ros",
         &["splat-types", "splat-image", "splat-msgs", "splat-io"],
     ),
+    ("splat-view", &["splat-types", "splat-msgs", "splat-ros"]),
 ];
 
 /// Lines that a file may have; beyond it there are two meanings in one file.
@@ -331,6 +332,12 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
         ),
         ("flate2", &["src/formats/spz.rs"][..]),
         ("zstd", &["src/formats/spz.rs"][..]),
+        ("axum", &["crates/splat-view/"][..]),
+        ("hyper", &["crates/splat-view/src/server.rs"][..]),
+        ("hyper_util", &["crates/splat-view/src/server.rs"][..]),
+        ("tokio", &["crates/splat-view/"][..]),
+        ("tokio_rustls", &["crates/splat-view/src/"][..]),
+        ("rcgen", &["crates/splat-view/src/tls.rs"][..]),
         ("maud", &["src/report/"][..]),
         ("clap", &["src/cli"][..]),
         ("indicatif", &["src/cli"][..]),

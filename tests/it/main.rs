@@ -89,6 +89,8 @@ mod tracking;
 mod tracking_node;
 mod trajectory;
 mod type_hashes;
+mod view_client;
+mod viewer;
 mod visual_odometry;
 mod written_scenes;
 mod xfeat;

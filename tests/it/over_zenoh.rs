@@ -108,7 +108,7 @@ pub fn free_endpoint() -> String {
 
 #[test]
 fn a_late_joiner_gets_the_newest_snapshot_and_the_same_ply() {
-    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), Vec::new()).unwrap();
     let endpoints = output.handles.publisher.endpoints();
     assert!(
         endpoints.len() == 1 && !endpoints[0].ends_with(":0"),
@@ -158,7 +158,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
     params.zenoh_connect = endpoint;
     params.namespace = "robot/mapper".to_owned();
     params.domain_id = 7;
-    let mut output = Output::open(&params, None).unwrap();
+    let mut output = Output::open(&params, Vec::new()).unwrap();
     assert!(output.handles.publisher.endpoints().is_empty());
     // Publishing begins when the peers know each other.
     let matching = session
@@ -206,7 +206,7 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
 
 #[test]
 fn a_peer_that_sends_noise_to_our_keys_harms_nobody() {
-    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), Vec::new()).unwrap();
     let session = client("", &output.handles.publisher.endpoints()[0]);
     let snapshot = Arc::new(random_snapshot(2000, 3, 1, 2));
     publish(&mut output, &snapshot);
@@ -269,7 +269,7 @@ impl Wire {
 
 #[test]
 fn a_peer_that_takes_nothing_in_is_cut_off_and_others_go_on() {
-    let mut output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let mut output = Output::open(&params("tcp/127.0.0.1:0"), Vec::new()).unwrap();
     let endpoint = output.handles.publisher.endpoints().remove(0);
     // 18 MB each: more than all buffers on the way hold.
     let snapshot = |revision| Arc::new(random_snapshot(60_000, 3, 3, revision));
@@ -325,7 +325,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
     let mut params = params("");
     params.zenoh_connect = endpoint.clone();
     let started = Stopwatch::start();
-    let mut output = Output::open(&params, None).unwrap();
+    let mut output = Output::open(&params, Vec::new()).unwrap();
     let snapshot = Arc::new(random_snapshot(100, 2, 1, 1));
     publish(&mut output, &snapshot);
     assert!(
@@ -339,7 +339,7 @@ fn a_peer_that_starts_after_the_mapper_is_found() {
 
 #[test]
 fn close_without_peers_is_quick() {
-    let output = Output::open(&params("tcp/127.0.0.1:0"), None).unwrap();
+    let output = Output::open(&params("tcp/127.0.0.1:0"), Vec::new()).unwrap();
     let started = Stopwatch::start();
     output.handles.publisher.close().unwrap();
     assert!(started.secs() < 2.0, "{} s", started.secs());
@@ -356,7 +356,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     std::fs::write(&path, text).unwrap();
     let mut params = params("nonsense that nobody reads");
     params.zenoh_config = path.display().to_string();
-    let mut output = Output::open(&params, None).unwrap();
+    let mut output = Output::open(&params, Vec::new()).unwrap();
     assert_eq!(
         output.handles.publisher.endpoints(),
         std::slice::from_ref(&endpoint)
@@ -367,7 +367,7 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
     output.handles.publisher.close().unwrap();
 
     std::fs::write(&path, "{ listen: ").unwrap();
-    let fault = Output::open(&params, None).unwrap_err().to_string();
+    let fault = Output::open(&params, Vec::new()).unwrap_err().to_string();
     assert!(
         fault.contains("publish.zenoh_config") && fault.ends_with("zenoh.json5"),
         "{fault}"
@@ -376,7 +376,8 @@ fn a_zenoh_configuration_file_stands_for_the_endpoints() {
 
 #[test]
 fn errors_name_the_parameter() {
-    let message = |params: PublishParams| Output::open(&params, None).unwrap_err().to_string();
+    let message =
+        |params: PublishParams| Output::open(&params, Vec::new()).unwrap_err().to_string();
     for bad in ["nonsense", "tcp/127.0.0.1", "warp/127.0.0.1:7447"] {
         let found = message(params(bad));
         assert!(found.contains("zenoh_listen"), "{bad}: {found}");
@@ -390,7 +391,7 @@ fn errors_name_the_parameter() {
     // A port that is taken.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("tcp/{}", listener.local_addr().unwrap());
-    let fault = Output::open(&params(&taken), None).unwrap_err();
+    let fault = Output::open(&params(&taken), Vec::new()).unwrap_err();
     assert!(
         matches!(fault, PublishError::Open { .. }) && fault.to_string().contains(&taken),
         "{fault}"

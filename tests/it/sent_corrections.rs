@@ -35,7 +35,7 @@ impl Transport for Kept {
 pub(crate) fn output() -> (Output, Sent) {
     let sent = Sent::default();
     let kept = Kept(Arc::clone(&sent));
-    let output = Output::open(&params(&[]).publish, Some(Box::new(kept)));
+    let output = Output::open(&params(&[]).publish, vec![Box::new(kept)]);
     (output.unwrap(), sent)
 }
 

@@ -14,7 +14,7 @@ use crate::publisher::Publisher;
 use crate::reports::Reports;
 use crate::status::PublishedStatus;
 use crate::submap_stream::SubmapStream;
-use crate::transport::{Delivery, Sample, Topic};
+use crate::transport::{Delivery, Event, Sample, Topic};
 use splat_msgs::correction_message::{self, MapCorrectionMsg};
 use splat_msgs::map_messages::{MAX_MESSAGE_BYTES, Messages, SplatDelta, splats_per_message};
 use splat_types::snapshot::Snapshot;
@@ -135,7 +135,12 @@ impl MapStream {
             let frame = latched.splat_frame();
             let message = correction_message::message(&correction, snapshot, frame);
             publisher.send(&Sample::of(&CORRECTION, snapshot.stamp, &message)?)?;
+            publisher.observe(&Event::Correction(&correction));
         }
+        publisher.observe(&Event::Map {
+            snapshot: held,
+            map_from_world,
+        });
         update.send(publisher, &latched.messages(&kept))?;
         let send = |sample: &Sample| publisher.send(sample);
         navigation::of_snapshot(snapshot, &map_from_world, &self.params, &send)?;

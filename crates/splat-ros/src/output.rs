@@ -59,10 +59,10 @@ pub struct Streams {
 }
 
 impl Output {
-    /// Opens the transports that the parameters ask for, and `transport` beside them.
+    /// Opens the transports that the parameters ask for, and `more` beside them.
     pub fn open(
         params: &PublishParams,
-        transport: Option<Box<dyn Transport>>,
+        more: Vec<Box<dyn Transport>>,
     ) -> Result<Self, PublishError> {
         let mount = mount_of(params)?;
         let cells = Arc::<FrameCells>::default();
@@ -105,7 +105,7 @@ impl Output {
             let transport = McapTransport::create(&PathBuf::from(&params.record))?;
             transports.push(Box::new(transport));
         }
-        transports.extend(transport);
+        transports.extend(more);
         // Time without an image counts from here.
         let reports = Arc::<Reports>::default();
         let streams = Streams {

@@ -24,6 +24,18 @@ pub struct PublishParams {
     pub namespace: String,
     /// MCAP file that all outgoing messages are written to; empty = none.
     pub record: String,
+    /// Address that the viewer's page is served on, for example 127.0.0.1:8642; 0.0.0.0:8642 for other machines; empty = none.
+    pub view: String,
+    /// What browsers must bring (?token=...); empty = nothing on this machine, a random one, printed at the start, for other machines.
+    pub view_token: String,
+    /// Encryption of the viewer: off; self_signed; or CERTIFICATE.pem,KEY.pem. Headsets offer VR only with it, or on localhost.
+    pub view_tls: String,
+    /// Browsers that may look at once.
+    #[schemars(range(min = 1, max = 64))]
+    pub view_clients: usize,
+    /// Highest degree of spherical harmonics that browsers get: 20 bytes a splat at 0, 28 at 1, 44 at 2, 60 at 3.
+    #[schemars(range(min = 0, max = 3))]
+    pub view_sh_degree: u8,
     /// Payload of one chunk of a snapshot.
     #[schemars(range(min = 1024, max = 262144))]
     pub chunk_bytes: usize,
@@ -83,6 +95,11 @@ impl Default for PublishParams {
             domain_id: 0,
             namespace: "splat_mapper".to_owned(),
             record: String::new(),
+            view: String::new(),
+            view_token: String::new(),
+            view_tls: "off".to_owned(),
+            view_clients: 16,
+            view_sh_degree: 3,
             chunk_bytes: 196608,
             full_map_period: 30.0,
             delta_share: 0.1,

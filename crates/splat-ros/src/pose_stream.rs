@@ -10,7 +10,7 @@ use crate::pose_messages::LiveMessages;
 use crate::publisher::Publisher;
 use crate::reports::Reports;
 use crate::slew::CorrectionLimiter;
-use crate::transport::Sample;
+use crate::transport::{Event, Sample};
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
 
@@ -63,6 +63,7 @@ impl PoseStream {
         }
         let mut world = self.frames.tree();
         let at = self.odometer.advance(frame, &mut world);
+        publisher.observe(&Event::Frame(&frame.tracked));
         self.frames.keep_anchor(&world);
         let Some(at) = at else {
             return Ok(());
@@ -112,6 +113,10 @@ impl PoseStream {
         } else {
             &camera.frame
         };
+        publisher.observe(&Event::Keyframe {
+            stamp: seen.stamp,
+            image: &seen.image,
+        });
         let cloud = navigation::keyframe_cloud(seen, metres, frame);
         publisher.send(&Sample::of(&KEYFRAME_CLOUD, seen.stamp, &cloud)?)
     }

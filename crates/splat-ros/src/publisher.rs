@@ -7,7 +7,7 @@ use std::sync::Arc;
 use crate::error::PublishError;
 use crate::latched::LatchedStore;
 use crate::service_server::ServiceServer;
-use crate::transport::{Delivery, Sample, Transport};
+use crate::transport::{Delivery, Event, Sample, Transport};
 
 /// The node's way out. It never changes once it is open, so threads share it as it is: a slow peer of the map holds up
 /// no pose. The latched store alone has a lock, since late joiners read what other threads send; it is held for a copy.
@@ -61,6 +61,13 @@ impl Publisher {
         }
         let sent = self.transports.iter().map(|transport| transport.send(post));
         sent.fold(Ok(()), Result::and)
+    }
+
+    /// Says to all transports what happens.
+    pub fn observe(&self, event: &Event<'_>) {
+        self.transports
+            .iter()
+            .for_each(|transport| transport.observe(event));
     }
 
     /// Ends all transports.

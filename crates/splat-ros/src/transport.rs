@@ -9,7 +9,12 @@ use serde::Serialize;
 use crate::error::PublishError;
 use splat_msgs::map_messages;
 use splat_msgs::ros::Message;
+use splat_types::correction::MapCorrection;
+use splat_types::image::RgbImage;
+use splat_types::snapshot::Snapshot;
 use splat_types::time::Stamp;
+use splat_types::tracking::TrackedFrame;
+use splat_types::transform::Similarity;
 
 /// How messages of a topic travel, as REP-2003 asks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,10 +80,33 @@ impl Sample {
     }
 }
 
+/// What happens, for transports that make messages of their own.
+#[derive(Debug, Clone, Copy)]
+pub enum Event<'a> {
+    /// The published map as clients hold it from now on.
+    Map {
+        snapshot: &'a Arc<Snapshot>,
+        /// Takes the splat frame to the robot's map frame.
+        map_from_world: Similarity,
+    },
+    /// What tracking says of a frame.
+    Frame(&'a TrackedFrame),
+    /// A keyframe's image, undistorted.
+    Keyframe {
+        stamp: Stamp,
+        image: &'a Arc<RgbImage>,
+    },
+    /// The map has moved as a whole; the next map shows it.
+    Correction(&'a MapCorrection),
+}
+
 /// A way out of the node. Called from several threads.
 pub trait Transport: Send + Sync {
     /// Returns when the message is handed over; a slow peer may hold up messages of a reliable topic for a while.
     fn send(&self, post: &Sample) -> Result<(), PublishError>;
+
+    /// Most make nothing of events: what they send is made for all of them.
+    fn observe(&self, _event: &Event<'_>) {}
 
     /// Where peers may connect; none for most.
     fn endpoints(&self) -> Vec<String> {

@@ -146,7 +146,7 @@ fn after_a_reset_the_next_map_goes_out_by_the_same_streams_and_services_reach_it
         let params = settings.params().expect("fits");
         let kept = Kept::default();
         let sent = Arc::clone(&kept.0);
-        let output = Output::open(&params.publish, Some(Box::new(kept))).expect("opens");
+        let output = Output::open(&params.publish, vec![Box::new(kept)]).expect("opens");
         let input = "synthetic:room?frames=24&width=64&height=48&speed=3";
         let source = ResetAt {
             inner: open_source::open(input, &params.source, 0).expect("always there"),
@@ -207,7 +207,7 @@ fn the_last_status_counts_what_selection_took() {
     let input = "synthetic:room?frames=24&width=64&height=48&speed=3";
     let job = Job {
         source: open_source::open(input, &params.source, 0).expect("always there"),
-        output: Some(Output::open(&params.publish, Some(Box::new(kept))).expect("opens")),
+        output: Some(Output::open(&params.publish, vec![Box::new(kept)]).expect("opens")),
         params,
         is_live: false,
         stop: Stop::default(),
