@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint zenoh-test formats-test layouts-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
+.PHONY: demo test lint zenoh-test formats-test viewer-test layouts-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -28,6 +28,10 @@ zenoh-test:
 # Maps and scenes that `export` writes, read by splat-transform, Khronos's glTF validator and pycolmap.
 formats-test:
 	scripts/formats_test
+
+# The viewer's page in headless Chromium, PARTS="poses" for some of it.
+viewer-test:
+	scripts/viewer_test $(PARTS)
 
 # Scenes of 100 images at 1,600 x 1,200 px in every layout of images and poses, mapped with the paper's settings; LAYOUTS="colmap" for some of them.
 layouts-test:

@@ -16,7 +16,7 @@ import { PROTOCOL } from "./wire";
 import { World, matrixOf, type Pinhole } from "./world";
 import { Headset, budget } from "./xr";
 
-/// For messages, of each frame.
+/// For messages, at a time.
 const SLICE_MS = 8;
 const EYE_MS = 500;
 
@@ -45,6 +45,8 @@ export class App implements Watcher {
   private fixed: { pose: Pose; lens: Pinhole } | null = null;
   private readonly background = new THREE.Color();
   private isCalm = false;
+  private isWorking = false;
+  private readonly turns = new MessageChannel();
   private last = performance.now();
   private eyeAt = 0;
   private toastTimer = 0;
@@ -62,8 +64,8 @@ export class App implements Watcher {
     this.connection = new Connection(
       {
         held: () => this.model.held(),
-        text: (text) => this.model.take(text),
-        binary: (bytes) => this.model.take(bytes),
+        text: (text) => this.take(text),
+        binary: (bytes) => this.take(bytes),
         link: (state, reason) => {
           if (state === "open") {
             this.timings.connectedAt = performance.now();
@@ -74,6 +76,9 @@ export class App implements Watcher {
       budget(),
     );
     this.root.append(this.panel.head, this.panel.side, this.bar(), this.photo.box, this.panel.note, this.toast, this.help);
+    this.turns.port1.onmessage = () => this.turn();
+    // On a phone the map comes first.
+    show(this.panel.side, window.innerWidth > 700);
     this.setLight(matchMedia("(prefers-color-scheme: light)").matches);
     this.listen();
     new ResizeObserver(() => this.resize()).observe(this.root);
@@ -90,10 +95,26 @@ export class App implements Watcher {
     source.then(
       (messages) => {
         this.panel.setLink("open", "");
-        messages.forEach((message) => this.model.take(message));
+        messages.forEach((message) => this.take(message));
       },
       (error: unknown) => this.fault(error),
     );
+  }
+
+  /// Messages are read between frames, in slices: a slow picture holds them up no more than they hold up the picture.
+  private take(message: string | ArrayBuffer): void {
+    this.model.take(message);
+    if (!this.isWorking) {
+      this.isWorking = true;
+      this.turns.port2.postMessage(null);
+    }
+  }
+
+  private turn(): void {
+    this.isWorking = !this.model.work(performance.now() + SLICE_MS);
+    if (this.isWorking) {
+      this.turns.port2.postMessage(null);
+    }
   }
 
   // What the model says.
@@ -232,7 +253,6 @@ export class App implements Watcher {
   private frame(now: number): void {
     const seconds = Math.min((now - this.last) / 1000, 0.1);
     this.last = now;
-    const isRead = this.model.work(performance.now() + SLICE_MS);
     const isUploaded = this.world.upload(this.model.store);
     if (this.timings.firstSplatsAt === 0 && this.model.store.nSplats() > 0) {
       this.timings.firstSplatsAt = performance.now();
@@ -252,7 +272,7 @@ export class App implements Watcher {
       this.connection.eye(this.world.eye());
     }
     this.world.render();
-    this.isCalm = isRead && isUploaded && !this.world.isSorting();
+    this.isCalm = !this.isWorking && isUploaded && !this.world.isSorting();
   }
 
   private sorted(): Keyframe[] {

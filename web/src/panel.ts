@@ -26,7 +26,7 @@ class Chart {
     private readonly unit: string,
     private readonly digits: number,
   ) {
-    this.canvas = element("canvas", { class: "chart", role: "img" });
+    this.canvas = element("canvas", { class: "chart", role: "img", "aria-label": name });
   }
 
   add(value: unknown): void {
@@ -101,20 +101,17 @@ export class Panel {
       this.fields.set(key, value);
       return [element("dt", {}, name), value];
     };
-    const list = (...rows: [string, string][]): HTMLElement =>
-      element("dl", {}, ...rows.flatMap(([key, name]) => field(key, name)));
+    const list = (kind: string, ...rows: [string, string][]): HTMLElement =>
+      element("dl", { class: kind }, ...rows.flatMap(([key, name]) => field(key, name)));
     this.side = element(
       "section",
       { class: "box side", "aria-label": "State of the mapper" },
       element("h2", {}, "Map"),
-      list(["splats", "Splats shown"], ["keyframes", "Keyframes"], ["submaps", "Submaps"], ["scale", "Scale"], ["revision", "Revision"]),
-      element("h2", {}, "Frames"),
-      list(["received", "Received"], ["tracked", "Tracked"], ["lost", "Without a pose"], ["dropped", "Dropped"], ["uncertain", "Position, 1 σ"]),
-      element("h2", {}, "Work"),
-      this.charts.latency.canvas,
-      this.charts.steps.canvas,
-      this.charts.splats.canvas,
-      this.charts.memory.canvas,
+      list("", ["splats", "Splats shown"], ["keyframes", "Keyframes"], ["scale", "Scale"], ["revision", "Revision"]),
+      element("h2", { class: "live" }, "Frames"),
+      list("live", ["submaps", "Submaps"], ["received", "Received"], ["tracked", "Tracked"], ["lost", "Without a pose"], ["dropped", "Dropped"], ["uncertain", "Position, 1 σ"]),
+      element("h2", { class: "live" }, "Work"),
+      element("div", { class: "live" }, this.charts.latency.canvas, this.charts.steps.canvas, this.charts.splats.canvas, this.charts.memory.canvas),
       this.warnings,
     );
     this.note = element("div", { class: "box note", role: "alert" });
@@ -123,6 +120,7 @@ export class Panel {
 
   setWelcome(welcome: Welcome): void {
     this.isLive = welcome.source === "live";
+    this.side.classList.toggle("still", !this.isLive);
     this.title.textContent = welcome.title || welcome.server;
     this.title.title = `${welcome.title} (${welcome.server})`;
     document.title = `${welcome.title || "map"} – splat-mapper`;
