@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::Mutex;
 
 use anyhow::Context;
@@ -32,6 +33,11 @@ use crate::report::html::{ReportInputs, write_html};
 use crate::report::pose_quality::write_health;
 use splat_slam::mapper::mapper::reports::SubmapReport;
 use splat_types::splats::layout::map_sha256;
+use splat_view::embedded;
+use splat_view::view_map::Published;
+
+/// Of a map that its report holds, before it is packed.
+const MAX_WALK_BYTES: usize = 10 << 20;
 
 /// Makes the directory and checks, before any work is done, that it can be written to.
 pub fn prepare(out: &Path) -> anyhow::Result<()> {
@@ -193,6 +199,10 @@ fn write_report(
         pose: *pose,
     });
     let truth: Vec<TimedPose> = truth.collect();
+    let published = Published::at_first_keyframe(Arc::clone(&outcome.snapshot));
+    let has_splats = !outcome.snapshot.splats.is_empty();
+    let walk = has_splats.then(|| embedded::frames(&published, input, MAX_WALK_BYTES));
+    let walk = walk.flatten();
     let page = ReportInputs {
         title: input,
         report,
@@ -203,6 +213,7 @@ fn write_report(
         keyframes,
         trajectory: &frames::trajectory(rows),
         reference: &truth,
+        walk: walk.as_deref(),
     };
     let results: [anyhow::Result<()>; 2] = [
         report.write(&out.join("report.json")).map_err(Into::into),

@@ -1,7 +1,7 @@
 //! `report.html`: one file that shows a run to people: figures, renders beside photos, curves, path, times.
 //!
-//! Self-contained: images are embedded, there is no script and nothing is fetched; the page says so to the browser
-//! by its content policy. All text goes through maud and is escaped.
+//! Self-contained: images are embedded, nothing is fetched, and there is no script but the viewer's where a small map is embedded, begun by a
+//! button; the page says so to the browser by its content policy. All text goes through maud and is escaped.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,6 +17,7 @@ use crate::eval::report_json::{Quality, Report};
 use crate::eval::trajectory::{TOLERANCE_SECS, TimedPose, associate};
 use crate::report::charts::{Curve, Paths, View, bars, curve_chart, trajectory_chart};
 use crate::report::comparisons::{Comparison, comparisons};
+use crate::report::walk;
 use splat_types::transform::Rigid;
 
 /// What the page shows; empty lists leave their section out.
@@ -39,6 +40,8 @@ pub struct ReportInputs<'a> {
     pub trajectory: &'a [TimedPose],
     /// Truth in a frame of its own; it is aligned to the keyframes here.
     pub reference: &'a [TimedPose],
+    /// Messages of the viewer; `None` where the map is too large, or has no splats.
+    pub walk: Option<&'a [u8]>,
 }
 
 pub fn write_html(inputs: &ReportInputs<'_>, path: &Path) -> Result<(), EvalError> {
@@ -57,7 +60,7 @@ fn page(inputs: &ReportInputs<'_>) -> image::ImageResult<Markup> {
             head {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
-                meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'";
+                meta http-equiv="Content-Security-Policy" content=(walk::policy(inputs.walk.is_some()));
                 title { (inputs.title) " - splat-mapper report" }
                 style { (PreEscaped(include_str!("report.css"))) }
             }
@@ -69,6 +72,7 @@ fn page(inputs: &ReportInputs<'_>) -> image::ImageResult<Markup> {
                     }
                     (notices(report, evaluation.as_ref()))
                     (tiles(report, evaluation.as_ref()))
+                    @if let Some(frames) = inputs.walk { (walk::section(frames)?) }
                     (comparisons(inputs.comparisons)?)
                     (curves(inputs))
                     (paths(inputs, evaluation.as_ref()))

@@ -6,4 +6,6 @@ pub mod comparisons;
 
 pub mod pose_quality;
 
+mod walk;
+
 pub mod html;

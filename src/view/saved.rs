@@ -6,13 +6,11 @@ use std::sync::Arc;
 use anyhow::bail;
 
 use crate::formats::file;
-use splat_ros::odometry::forward_camera;
 use splat_slam::mapper::keyframes::image_codec::SavedView;
 use splat_slam::mapper::map_file::checkpoint;
 use splat_types::snapshot::{Scale, Snapshot};
 use splat_types::splats::splats::Splats;
 use splat_types::time::Stamp;
-use splat_types::transform::{Rigid, Similarity};
 use splat_view::hub::Hub;
 use splat_view::view_map::Published;
 
@@ -68,26 +66,7 @@ impl SavedMap {
             };
             hub.thumbnail(*stamp, jpeg);
         }
-        hub.publish(published(self.snapshot));
-    }
-}
-
-/// The map frame begins at the first keyframe, as a robot's that looks ahead.
-pub fn published(snapshot: Snapshot) -> Published {
-    let scale = snapshot.scale.metres_per_unit.unwrap_or(1.0);
-    let first = snapshot
-        .poses
-        .first()
-        .map(|pose| pose.world_from_cam)
-        .unwrap_or(Rigid::IDENTITY);
-    let rotation = forward_camera().rotation * first.rotation.inverse();
-    Published {
-        map_from_world: Similarity {
-            scale,
-            rotation,
-            translation: -(rotation * first.translation) * scale,
-        },
-        snapshot: Arc::new(snapshot),
+        hub.publish(Published::at_first_keyframe(Arc::new(self.snapshot)));
     }
 }
 

@@ -146,6 +146,7 @@ fn write_sample(report: &Report, title: &str, comparisons: &[Comparison], path: 
         keyframes: &keyframes,
         trajectory: &walk(200, 0.02),
         reference: &reference,
+        walk: None,
     };
     write_html(&inputs, path).unwrap();
     std::fs::read_to_string(path).unwrap()
@@ -285,6 +286,7 @@ fn a_run_that_made_nothing_still_has_a_page() {
             keyframes,
             trajectory: keyframes,
             reference: &nowhere,
+            walk: None,
         };
         write_html(&inputs, &path).unwrap();
         let page = std::fs::read_to_string(&path).unwrap();

@@ -330,7 +330,7 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
                 "crates/splat-slam/src/track/landmark_file",
             ][..],
         ),
-        ("flate2", &["src/formats/spz.rs"][..]),
+        ("flate2", &["src/formats/spz.rs", "src/report/walk.rs"][..]),
         ("zstd", &["src/formats/spz.rs"][..]),
         ("axum", &["crates/splat-view/"][..]),
         ("hyper", &["crates/splat-view/src/server.rs"][..]),

@@ -4,6 +4,7 @@
 import { execFileSync, spawn } from "node:child_process";
 import { mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
+import { resolve } from "node:path";
 import { createInterface } from "node:readline";
 import { OUT, launch, settled, state, watch } from "./look.mjs";
 
@@ -184,6 +185,23 @@ async function comparison(png) {
   return 10 * Math.log10((255 ** 2 * a.length * 0.75) / sum);
 }
 
+async function report(browser) {
+  const page = await browser.newPage();
+  await page.setViewport({ width: 1280, height: 1000 });
+  page.faults = watch(page);
+  await page.goto(`file://${resolve(out)}/live/report.html`);
+  await page.click("#walk");
+  await page.waitForFunction(() => window.splatMapper?.revision() > 0, { timeout: 60000 });
+  await settled(page);
+  await page.evaluate(() => document.getElementById("splat-mapper-viewer").scrollIntoView());
+  await page.screenshot({ path: `${OUT}/report.png` });
+  const found = await state(page);
+  const { splats } = JSON.parse(readFileSync(`${out}/live/report.json`));
+  check(found.n === splats, "the report holds the map");
+  check(found.errors.length === 0 && page.faults.length === 0, `no error in the report: ${[...found.errors, ...page.faults].join("; ")}`);
+  await page.close();
+}
+
 async function headset(browser, url) {
   const emulator = readFileSync(createRequire(import.meta.url).resolve("iwer/build/iwer.min.js"), "utf8");
   const install = `${emulator}; window.device = new IWER.XRDevice(IWER.metaQuest3); window.device.installRuntime({ forceInstall: true });`;
@@ -223,7 +241,7 @@ async function million(browser) {
 mkdirSync(out, { recursive: true });
 const browser = await launch();
 try {
-  const parts = { live, random, poses, million };
+  const parts = { live, report, random, poses, million };
   const names = process.argv.slice(6);
   for (const [name, part] of Object.entries(parts)) {
     if (names.length === 0 || names.includes(name)) {

@@ -18,9 +18,11 @@ pub mod hub;
 
 pub mod sync;
 
+pub mod embedded;
+
 mod session;
 
-mod page;
+pub mod page;
 
 mod access;
 

@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::chunk::{Chunk, Source};
+use splat_ros::odometry::forward_camera;
 use splat_types::snapshot::{KeyframePose, Scale, Snapshot};
-use splat_types::transform::Similarity;
+use splat_types::transform::{Rigid, Similarity};
 
 /// A keyframe with fewer splats shares the chunk of the one before it.
 const MIN_SPLATS: usize = 2048;
@@ -18,6 +19,24 @@ pub struct Published {
     pub snapshot: Arc<Snapshot>,
     /// Takes the splat frame to the robot's map frame.
     pub map_from_world: Similarity,
+}
+
+impl Published {
+    /// The map frame begins at the first keyframe, as a robot's whose camera looks ahead.
+    pub fn at_first_keyframe(snapshot: Arc<Snapshot>) -> Self {
+        let scale = snapshot.scale.metres_per_unit.unwrap_or(1.0);
+        let first = snapshot.poses.first();
+        let first = first.map_or(Rigid::IDENTITY, |pose| pose.world_from_cam);
+        let rotation = forward_camera().rotation * first.rotation.inverse();
+        Self {
+            map_from_world: Similarity {
+                scale,
+                rotation,
+                translation: -(rotation * first.translation) * scale,
+            },
+            snapshot,
+        }
+    }
 }
 
 /// What clients see; never changes.
