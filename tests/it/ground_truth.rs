@@ -81,6 +81,25 @@ fn known_poses_without_depth_images_get_depth_by_stereo() {
     }
 }
 
+#[test]
+fn keyframes_without_a_pose_are_left_out_unless_none_has_one() {
+    let (frames, extent) = room();
+    let mut gaps = numbered(&frames, false);
+    [2, 3].map(|ix: usize| gaps[ix].1.truth = None);
+    let ids = |views: &[View]| views.iter().map(|v| v.keyframe_id).collect::<Vec<_>>();
+    let mut model = known(params().ground_truth, extent);
+    let first = model.infer(&batch(0, 0, &gaps[..5])).unwrap();
+    assert_eq!(ids(&first.views), [0, 1, 4]);
+    let note = first.note.unwrap();
+    assert!(note.starts_with("2 keyframes without"), "{note}");
+    let second = model.infer(&batch(1, 2, &gaps[3..])).unwrap();
+    assert_eq!(ids(&second.views), [4, 5, 6, 7]);
+    assert_eq!(ids(&model.finish().unwrap().views), [0, 1, 4, 5, 6, 7]);
+    let none: Vec<(u32, Frame)> = gaps[2..4].to_vec();
+    let error = known(params().ground_truth, extent).infer(&batch(0, 0, &none));
+    assert!(error.unwrap_err().to_string().contains("keyframe 2"));
+}
+
 fn check_depth(view: &View, frame: &Frame) {
     let truth = frame.sensor_depth.as_ref().unwrap();
     let depth = &view.depth;

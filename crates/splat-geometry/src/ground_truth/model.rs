@@ -5,7 +5,7 @@
 //! that, each by its own noise: depth that rested on poses 1 deg off would be none at all, as neighbouring images
 //! would lie several pixels beside the lines on which stereo looks for them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -48,6 +48,10 @@ pub struct GroundTruthModel {
     aligner: Option<Aligner>,
     /// Without windows, where matches are wanted.
     pairs: Option<PairMatcher>,
+    /// A keyframe has had a pose.
+    has_posed: bool,
+    /// Keyframes that had none.
+    left_out: BTreeSet<u32>,
 }
 
 impl GroundTruthModel {
@@ -74,6 +78,8 @@ impl GroundTruthModel {
             disturbed: BTreeMap::new(),
             aligner: None,
             pairs: None,
+            has_posed: false,
+            left_out: BTreeSet::new(),
         })
     }
 
@@ -234,12 +240,24 @@ impl GeometryModel for GroundTruthModel {
     }
 
     fn infer(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
-        if self.aligner.is_some() {
-            return self.infer_window(batch);
-        }
-        let mut answer = self.infer_batch(batch)?;
+        let posed = self.posed(batch)?;
+        let mut answer = if posed.keyframes.is_empty() {
+            GeometryBatch {
+                batch_id: batch.id,
+                ..GeometryBatch::default()
+            }
+        } else if self.aligner.is_some() {
+            self.infer_window(&posed)?
+        } else {
+            self.infer_batch(&posed)?
+        };
         if let Some(pairs) = &mut self.pairs {
-            answer.pair_matches = pairs.matches(&answer.views, batch);
+            answer.pair_matches = pairs.matches(&answer.views, &posed);
+        }
+        let n = self.left_out.len();
+        if n > 0 {
+            let note = format!("{n} keyframes without a ground truth pose were left out");
+            answer.note = answer.note.or(Some(note));
         }
         Ok(answer)
     }
@@ -260,6 +278,22 @@ impl GeometryModel for GroundTruthModel {
 }
 
 impl GroundTruthModel {
+    /// The keyframes of a batch that have a pose: ground truth often begins late, or has gaps. An error where no keyframe has had any.
+    fn posed(&mut self, batch: &Batch) -> Result<Batch, GeometryError> {
+        let lacks = |keyframe: &&Arc<Keyframe>| keyframe.frame.truth.is_none();
+        let lacking = batch.keyframes.iter().filter(lacks);
+        self.left_out.extend(lacking.map(|keyframe| keyframe.id));
+        let mut posed = batch.clone();
+        posed.keyframes.retain(|k| k.frame.truth.is_some());
+        let shared = batch.keyframes.iter().take(batch.n_shared);
+        posed.n_shared = shared.filter(|k| k.frame.truth.is_some()).count();
+        self.has_posed |= !posed.keyframes.is_empty();
+        match batch.keyframes.first() {
+            Some(first) if !self.has_posed => truth_of(first).map(|_| posed),
+            _ => Ok(posed),
+        }
+    }
+
     fn infer_batch(&mut self, batch: &Batch) -> Result<GeometryBatch, GeometryError> {
         let ready = self.views_without_stereo(batch)?;
         if ready.len() == batch.keyframes.len() {
