@@ -44,7 +44,7 @@ enum Command {
     Compare(CompareArgs),
     /// Renders a map from given poses
     Render(RenderArgs),
-    /// Shows a saved map in a browser, until Ctrl-C
+    /// Shows a map in a browser, until Ctrl-C
     View(ViewArgs),
     /// Converts a map to another format
     Export(ExportArgs),
@@ -139,14 +139,18 @@ struct LocaliseArgs {
     /// Prints JSON
     #[arg(long)]
     json: bool,
+    /// Serves a page that shows the camera in the map: ADDRESS:PORT, else 127.0.0.1:8642
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = viewer::DEFAULT_ADDRESS)]
+    view: Option<String>,
     #[command(flatten)]
     params: ParamArgs,
 }
 
 #[derive(Debug, Args)]
 struct ViewArgs {
-    /// map.splatmap, the directory of a run, or a .ply or .spz of any program
-    #[arg(value_name = "MAP|RUN_DIR")]
+    /// map.splatmap, the directory of a run, or a .ply or .spz of any program; zenoh:ENDPOINT follows a mapper elsewhere (zenoh: alone finds one),
+    /// FILE.mcap of publish.record shows what it sent
+    #[arg(value_name = "MAP|RUN_DIR|zenoh:ENDPOINT|FILE.mcap")]
     map: String,
     /// Address of the page; publish.view_* has token and encryption
     #[arg(long, value_name = "ADDRESS:PORT")]

@@ -16,6 +16,7 @@ use crate::node::stop::Stop;
 use crate::node::{localise, open_source, pipeline, ros2, run_dir};
 use crate::params::error::ParamsError;
 use crate::params::settings::Settings;
+use crate::view::saved;
 use crate::view::viewer::{self, Shown};
 use splat_types::time::Stopwatch;
 
@@ -93,6 +94,7 @@ pub(crate) fn replay(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 
 pub(crate) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     let mut settings = settings(&args.params)?;
+    set_view(&mut settings, args.view.as_deref())?;
     let params = settings.params().map_err(|e| usage(&e))?;
     if let Some(out) = &args.out {
         run_dir::prepare(out)?;
@@ -104,7 +106,12 @@ pub(crate) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     stop_on_ctrl_c(&stop)?;
     source.end_when(stop.flag());
     let out = args.out.as_deref();
-    let found = localise::localise(&args.map, source.as_mut(), &params, out, &stop)?;
+    let viewer = viewer::start(&params.publish, Shown::Live, &args.input, true)?;
+    if let Some(viewer) = &viewer {
+        saved::read(&args.map)?.show(viewer.hub());
+    }
+    let hub = viewer.as_ref().map(|viewer| &**viewer.hub());
+    let found = localise::localise(&args.map, source.as_mut(), &params, out, (&stop, hub))?;
     let reported = &found.tracking;
     if args.json {
         say(serde_json::to_string_pretty(&found)?);

@@ -10,6 +10,7 @@ use crate::eval::report_json::TrackingFigures;
 use crate::eval::trajectory::write_tum;
 use crate::node::engines::Engines;
 use crate::node::page_file::PageFile;
+use crate::node::publish_threads::LiveEvent;
 use crate::node::run_dir::tracking_figures;
 use crate::node::stop::{ShutdownTimeout, Stop};
 use crate::node::track_thread::TrackStage;
@@ -21,6 +22,7 @@ use splat_slam::track::params::Photometric;
 use splat_slam::track::tracker::Tracker;
 use splat_types::snapshot::Scale;
 use splat_types::time::Stopwatch;
+use splat_view::hub::Hub;
 
 /// What came of it, `localisation.json`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -35,13 +37,13 @@ pub struct Localisation {
     pub reason: Option<String>,
 }
 
-/// Tracks a source through a map until it ends; writes `trajectory.tum`, `frames.csv` and `localisation.json` to `out`.
+/// Tracks a source through a map until it ends, shown in `viewer` where there is one; writes `trajectory.tum`, `frames.csv` and `localisation.json` to `out`.
 pub fn localise(
     map: &Path,
     source: &mut dyn Source,
     params: &Params,
     out: Option<&Path>,
-    stop: &Stop,
+    (stop, viewer): (&Stop, Option<&Hub>),
 ) -> anyhow::Result<Localisation> {
     let saved = checkpoint::read(map)?;
     let landmarks = saved.landmarks.clone();
@@ -65,10 +67,15 @@ pub fn localise(
     } else {
         None
     };
-    let mut stage = TrackStage::of(Some(tracker), false);
+    let mut stage = TrackStage::of(Some(tracker), false).received(viewer.is_some());
     stage.grace = ShutdownTimeout::new(stop.clone());
     while let Some(frame) = source.next().filter(|_| !stop.is_asked()) {
         stage.track(&frame, &Stopwatch::start());
+        for event in stage.take_events() {
+            if let (LiveEvent::Frame(event), Some(viewer)) = (event, viewer) {
+                viewer.frame(&event.tracked);
+            }
+        }
         if let Some(splats) = &mut splats {
             let mut fault = None;
             stage.fit(&mut |placement| {

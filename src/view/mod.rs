@@ -3,3 +3,5 @@
 pub mod viewer;
 
 pub mod saved;
+
+pub mod followed;

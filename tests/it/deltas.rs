@@ -18,7 +18,7 @@ const CHUNK_BYTES: usize = 8192;
 const MAX_BYTES: usize = 64 << 20;
 
 /// (type, payload) of a whole snapshot.
-fn whole(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
+pub fn whole(snapshot: &Snapshot) -> Vec<(String, Vec<u8>)> {
     let messages = Messages::new(snapshot, FRAME, CHUNK_BYTES);
     let mut sent = vec![(
         dds_type_name::<SplatManifest>(),

@@ -85,7 +85,9 @@ fn known_poses_without_depth_images_get_depth_by_stereo() {
 fn keyframes_without_a_pose_are_left_out_unless_none_has_one() {
     let (frames, extent) = room();
     let mut gaps = numbered(&frames, false);
-    [2, 3].map(|ix: usize| gaps[ix].1.truth = None);
+    gaps[2..4]
+        .iter_mut()
+        .for_each(|(_, frame)| frame.truth = None);
     let ids = |views: &[View]| views.iter().map(|v| v.keyframe_id).collect::<Vec<_>>();
     let mut model = known(params().ground_truth, extent);
     let first = model.infer(&batch(0, 0, &gaps[..5])).unwrap();

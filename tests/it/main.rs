@@ -91,6 +91,7 @@ mod trajectory;
 mod type_hashes;
 mod view_client;
 mod viewer;
+mod viewer_strangers;
 mod visual_odometry;
 mod written_scenes;
 mod xfeat;

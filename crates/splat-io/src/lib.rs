@@ -14,6 +14,8 @@ mod bag_channel;
 
 mod bag_file;
 
+pub mod messages;
+
 pub mod bag_writer;
 
 pub mod calibration;

@@ -8,7 +8,7 @@ use crate::ros::{
 };
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::snapshot::Snapshot;
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, Similarity};
 
 /// `splat_mapper_msgs/msg/MapCorrection`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -49,13 +49,40 @@ pub fn message(correction: &MapCorrection, snapshot: &Snapshot, frame: &str) -> 
     }
 }
 
-/// The numbers of `MapCorrection.msg`.
+/// In the order of the numbers of `MapCorrection.msg`.
+const REASONS: [Reason; 5] = [
+    Reason::Loop,
+    Reason::Merge,
+    Reason::Reset,
+    Reason::Loaded,
+    Reason::Renumbered,
+];
+
 fn code(reason: Reason) -> u8 {
-    match reason {
-        Reason::Loop => 0,
-        Reason::Merge => 1,
-        Reason::Reset => 2,
-        Reason::Loaded => 3,
-        Reason::Renumbered => 4,
+    REASONS
+        .iter()
+        .position(|known| *known == reason)
+        .unwrap_or(0) as u8
+}
+
+impl MapCorrectionMsg {
+    /// `None` where a number is none, or the reason unknown.
+    pub fn to_correction(&self) -> Option<MapCorrection> {
+        let moved = self.new_world_from_old_world.to_rigid()?;
+        let numbers = [self.scale, self.translation, self.rotation_rad];
+        let is_sound = numbers.iter().all(|v| v.is_finite()) && self.scale > 0.0;
+        let reason = *REASONS.get(usize::from(self.reason))?;
+        is_sound.then_some(MapCorrection {
+            epoch: self.epoch,
+            revision: self.revision,
+            new_world_from_old_world: Similarity {
+                scale: self.scale,
+                rotation: moved.rotation,
+                translation: moved.translation,
+            },
+            translation: self.translation,
+            rotation_rad: self.rotation_rad,
+            reason,
+        })
     }
 }

@@ -8,3 +8,6 @@ mod session;
 
 #[cfg(feature = "zenoh")]
 pub mod transport;
+
+#[cfg(feature = "zenoh")]
+pub mod subscriber;
