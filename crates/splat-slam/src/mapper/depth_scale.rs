@@ -34,12 +34,16 @@ pub(crate) fn scale_depths(
     if source == ScaleSource::Given || engine.len() == 0 {
         return Ok(());
     }
+    let is_due =
+        |p: &RegisteredKeyframe| p.depth_fit.n_looks < N_LOOKS && !p.is_held_out && p.home.is_here;
+    // Reading poses waits for all steps that a GPU has been given.
+    if !keyframes.registered().values().any(is_due) {
+        return Ok(());
+    }
     let map_poses = engine.poses()?;
     let focal_factor = engine.focal_scale()?;
-    let is_due = |p: &&mut RegisteredKeyframe| {
-        p.depth_fit.n_looks < N_LOOKS && !p.is_held_out && p.home.is_here
-    };
-    for registered in keyframes.values_mut().filter(is_due).take(max_views) {
+    let due = keyframes.values_mut().filter(|p| is_due(p));
+    for registered in due.take(max_views) {
         registered.depth_fit.n_looks += 1;
         let intrinsics = registered.intrinsics.refocused(focal_factor);
         let pose = &map_poses[registered.view_ix];
