@@ -91,6 +91,7 @@ fn gpu_steps(c: &mut Criterion) {
             any_kind: true,
             subgroups,
             float_atomics,
+            lanes: None,
         };
         for (name, n, size_px) in SIZES {
             let Ok(mut engine) = WgpuEngine::new(wanted) else {
@@ -122,6 +123,7 @@ fn maps(c: &mut Criterion) {
             any_kind: true,
             subgroups: true,
             float_atomics: false,
+            lanes: None,
         };
         if let Ok(mut engine) = WgpuEngine::new(wanted) {
             bench_step(c, "step_in_map_wgpu", name, &mut engine, &all, view);
@@ -146,6 +148,7 @@ fn sweeps(c: &mut Criterion) {
         any_kind: true,
         subgroups: true,
         float_atomics: false,
+        lanes: None,
     };
     if let Ok(mut gpu) = GpuMatcher::open(wanted) {
         group.bench_function("wgpu", |b| {

@@ -61,6 +61,7 @@ fn main() -> anyhow::Result<()> {
             any_kind: true,
             subgroups: true,
             float_atomics: false,
+            lanes: None,
         })?),
     };
     set_up(&mut *engine)?;

@@ -10,8 +10,7 @@
 @group(0) @binding(1) var<storage, read> first_instances: array<u32>;
 @group(0) @binding(2) var<storage, read_write> camera: Camera;
 @group(0) @binding(3) var<storage, read_write> n_instances: array<u32>;
-@group(0) @binding(4) var<storage, read_write> table_length: array<u32>;
-@group(0) @binding(5) var<storage, read_write> args: array<u32>;
+@group(0) @binding(4) var<storage, read_write> args: array<u32>;
 
 @compute @workgroup_size(1)
 fn main() {
@@ -31,7 +30,6 @@ fn main() {
     }
     camera.n_instances = n;
     n_instances[0] = n;
-    table_length[0] = DIGITS * ((n + SORT_BLOCK - 1u) / SORT_BLOCK);
     write_args(ARGS_INSTANCES, n, 256u);
     write_args(ARGS_SORT_INSTANCES, n, SORT_BLOCK);
 }

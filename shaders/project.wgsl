@@ -24,13 +24,16 @@ fn color_of(base: vec3<f32>, splat_ix: u32, direction: vec3<f32>) -> vec3<f32> {
     if step.sh_degree == 0u {
         return color;
     }
-    var basis = sh_basis(direction);
+    let basis = sh_basis(direction);
     let first = splat_ix * n_sh_rest(step.sh_stored);
     let n = n_sh_rest(step.sh_degree) / 3u;
-    for (var b = 0u; b < n; b += 1u) {
-        let at = first + 3u * b;
-        color += basis[b] * vec3<f32>(sh_rest[at], sh_rest[at + 1u], sh_rest[at + 2u]);
+    // Written out, so that the basis stays in registers.
+#repeat b 15
+    if $bu < n {
+        let at = first + 3u * $bu;
+        color += basis[$b] * vec3<f32>(sh_rest[at], sh_rest[at + 1u], sh_rest[at + 2u]);
     }
+#end
     return color;
 }
 

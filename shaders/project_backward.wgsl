@@ -54,11 +54,13 @@ fn direction_gradient(splat_ix: u32, direction: vec3<f32>, distance: f32, v_colo
     let first = splat_ix * n_sh_rest(step.sh_stored);
     let n = n_sh_rest(step.sh_degree) / 3u;
     var by_direction = vec3<f32>(0.0);
-    for (var b = 0u; b < n; b += 1u) {
-        let at = first + 3u * b;
+#repeat b 15
+    if $bu < n {
+        let at = first + 3u * $bu;
         let worth = dot(vec3<f32>(sh_rest[at], sh_rest[at + 1u], sh_rest[at + 2u]), v_color);
-        by_direction += worth * sh_basis_gradient(direction, b);
+        by_direction += worth * sh_basis_gradient(direction, $bu);
     }
+#end
     return (by_direction - direction * dot(by_direction, direction)) / distance;
 }
 
@@ -172,10 +174,22 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     sums[256u + lane] = sum1;
     sums[512u + lane] = sum2;
     workgroupBarrier();
+    // Sixteen at a time, then the sixteens.
+    var part_sum = vec4<f32>(0.0);
+    if lane < 48u {
+        for (var other = 16u * lane; other < 16u * (lane + 1u); other += 1u) {
+            part_sum += sums[other];
+        }
+    }
+    workgroupBarrier();
+    if lane < 48u {
+        sums[lane] = part_sum;
+    }
+    workgroupBarrier();
     if lane < 3u && block * 256u < camera.n_visible {
         var total = vec4<f32>(0.0);
-        for (var other = 0u; other < 256u; other += 1u) {
-            total += sums[256u * lane + other];
+        for (var part = 16u * lane; part < 16u * (lane + 1u); part += 1u) {
+            total += sums[part];
         }
         pose_sums[3u * block + lane] = total;
     }

@@ -6,6 +6,7 @@
 #import shape
 #import projected
 #import blend
+#import batch
 
 @group(0) @binding(0) var<uniform> step: Step;
 @group(0) @binding(1) var<storage, read> projected: array<Projected>;
@@ -16,6 +17,9 @@
 @group(0) @binding(5) var<storage, read_write> depth_sum: array<f32>;
 // Splats looked at before the whole tile had stopped; the host clears them.
 @group(0) @binding(6) var<storage, read_write> n_used: array<atomic<u32>>;
+
+// Whether a pixel of the tile has not stopped, by turns.
+var<workgroup> is_open: array<atomic<u32>, 2>;
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
@@ -32,32 +36,59 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var t_$i = select(-1.0, 1.0, all(corner + pixel_in_tile($iu, lane) < size_px));
     var light_$i = vec4<f32>(0.0);
 #end
-    var k = range.x;
+    if lane < 2u {
+        atomicStore(&is_open[lane], 0u);
+    }
+    workgroupBarrier();
+    var begin = range.x;
+    var n_looked_at = 0u;
+    var turn = 0u;
     loop {
         var most = -1.0;
 #repeat i PIXELS
         most = max(most, t_$i);
 #end
-        if k >= range.y || most <= 0.0 {
+        if most > 0.0 {
+            atomicStore(&is_open[turn], 1u);
+        }
+        fetch_batch(begin, range.y, lane, corner);
+        workgroupBarrier();
+        // The same for all lanes: pixels of the tile that have not stopped, and splats that are left.
+        if begin >= range.y || atomicLoad(&is_open[turn]) == 0u {
             break;
         }
-        let end = min(k + SPLATS_PER_LOOK, range.y);
-        for (; k < end; k += 1u) {
-            let splat = projected[instances[k]];
-            let ellipse = ellipse_of(splat, corner);
-            let payload = vec4<f32>(splat.red, splat.green, splat.blue, splat.depth);
+        if lane == 0u {
+            atomicStore(&is_open[1u - turn], 0u);
+        }
+        let n = min(BATCH, range.y - begin);
+        var k = 0u;
+        while k < n && most > 0.0 {
+            let end = min(k + SPLATS_PER_LOOK, n);
+            for (; k < end; k += 1u) {
+                let ellipse = ellipse_in_batch(k);
+                let payload = payload_in_batch(k);
 #repeat i PIXELS
-            {
-                let alpha = min(raw_alpha(ellipse, ellipse.center - pixel_in_tile($iu, lane)), MAX_ALPHA);
-                let next = t_$i * (1.0 - alpha);
-                let is_over = next <= MIN_TRANSMITTANCE;
-                light_$i += select(alpha * t_$i, 0.0, is_over) * payload;
-                t_$i = select(next, -abs(t_$i), is_over);
+                let d_$i = ellipse.center - pixel_in_tile($iu, lane);
+                if abs(d_$i.y) <= ellipse.reach {
+                    let alpha = min(raw_alpha(ellipse, d_$i), MAX_ALPHA);
+                    let next = t_$i * (1.0 - alpha);
+                    let is_over = next <= MIN_TRANSMITTANCE;
+                    light_$i += select(alpha * t_$i, 0.0, is_over) * payload;
+                    t_$i = select(next, -abs(t_$i), is_over);
+                }
+#end
             }
+            most = -1.0;
+#repeat i PIXELS
+            most = max(most, t_$i);
 #end
         }
+        n_looked_at = select(n_looked_at, begin - range.x + k, k > 0u);
+        workgroupBarrier();
+        begin += BATCH;
+        turn = 1u - turn;
     }
-    atomicMax(&n_used[tile], k - range.x);
+    atomicMax(&n_used[tile], n_looked_at);
 #repeat i PIXELS
     {
         let at = first + vec2<u32>(pixel_in_tile($iu, lane));

@@ -6,9 +6,7 @@
 @group(0) @binding(0) var<storage, read> length: array<u32>;
 @group(0) @binding(1) var<storage, read_write> block_sums: array<u32>;
 
-var<workgroup> partial: array<u32, 64>;
-
-@compute @workgroup_size(64)
+@compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) lane: u32) {
     let n_blocks = (length[0] + SCAN_BLOCK - 1u) / SCAN_BLOCK;
     let share = (n_blocks + SCAN_THREADS - 1u) / SCAN_THREADS;
@@ -18,12 +16,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     for (var i = first; i < end; i += 1u) {
         sum += block_sums[i];
     }
-    partial[lane] = sum;
-    workgroupBarrier();
-    var before = 0u;
-    for (var thread = 0u; thread < lane; thread += 1u) {
-        before += partial[thread];
-    }
+    var before = sum_before(lane, sum);
     for (var i = first; i < end; i += 1u) {
         let own = block_sums[i];
         block_sums[i] = before;

@@ -10,17 +10,16 @@
 
 var<workgroup> total: atomic<u32>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let block = flat(group, groups);
     if lane == 0u {
         atomicStore(&total, 0u);
     }
     workgroupBarrier();
-    let first = block * SCAN_BLOCK + lane * SCAN_PER_THREAD;
-    let end = min(first + SCAN_PER_THREAD, length[0]);
+    let end = min((block + 1u) * SCAN_BLOCK, length[0]);
     var sum = 0u;
-    for (var i = first; i < end; i += 1u) {
+    for (var i = block * SCAN_BLOCK + lane; i < end; i += SCAN_THREADS) {
         sum += numbers[i];
     }
     atomicAdd(&total, sum);

@@ -1,5 +1,6 @@
 // sort_count: keys -> how many of each digit there are in each block of 2,048.
-// First stage of a pass of the radix sort; a scan of the table follows. One workgroup per block.
+// First stage of a pass of the radix sort; sort_rows follows. One workgroup per block, one thread
+// per digit.
 
 #import flat
 #import sorting
@@ -12,25 +13,20 @@
 
 var<workgroup> counts: array<atomic<u32>, 256>;
 
-@compute @workgroup_size(32)
+@compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let n = length[0];
     let block = flat(group, groups);
     let n_blocks = (n + SORT_BLOCK - 1u) / SORT_BLOCK;
-    for (var digit = lane; digit < DIGITS; digit += SORT_THREADS) {
-        atomicStore(&counts[digit], 0u);
-    }
+    atomicStore(&counts[lane], 0u);
     workgroupBarrier();
-    let first = block * SORT_BLOCK + lane * KEYS_PER_THREAD;
-    let end = min(first + KEYS_PER_THREAD, n);
-    for (var i = first; i < end; i += 1u) {
+    let end = min((block + 1u) * SORT_BLOCK, n);
+    for (var i = block * SORT_BLOCK + lane; i < end; i += DIGITS) {
         atomicAdd(&counts[(keys[i] >> sort_pass.shift) & 255u], 1u);
     }
     workgroupBarrier();
     if block >= n_blocks {
         return;
     }
-    for (var digit = lane; digit < DIGITS; digit += SORT_THREADS) {
-        table[digit * n_blocks + block] = atomicLoad(&counts[digit]);
-    }
+    table[lane * n_blocks + block] = atomicLoad(&counts[lane]);
 }

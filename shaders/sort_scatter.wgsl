@@ -1,18 +1,25 @@
 // sort_scatter: keys with values -> the same in order of one digit, equal digits as they were.
-// After the scan of sort_count's table. One workgroup per block.
+// After sort_rows. One workgroup per block. For adapters without subgroups of a known size; see
+// sort_scatter_subgroups.
 
 #import flat
 #import sorting
+#import digit_starts
 
 @group(0) @binding(0) var<uniform> sort_pass: SortPass;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
 @group(0) @binding(3) var<storage, read> length: array<u32>;
-// By digit, then block: where the block's first key with that digit goes.
+// By digit, then block: keys with that digit in the blocks before.
 @group(0) @binding(4) var<storage, read> offsets: array<u32>;
-@group(0) @binding(5) var<storage, read_write> sorted_keys: array<u32>;
-@group(0) @binding(6) var<storage, read_write> sorted_values: array<u32>;
+// Keys with each digit.
+@group(0) @binding(5) var<storage, read> totals: array<u32>;
+@group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
+@group(0) @binding(7) var<storage, read_write> sorted_values: array<u32>;
 
+const SORT_THREADS: u32 = 32u;
+// Neighbouring keys that one thread takes, in order.
+const KEYS_PER_THREAD: u32 = SORT_BLOCK / SORT_THREADS;
 // Per digit, half a word per thread: a block has fewer than 65,536 keys.
 const WORDS: u32 = SORT_THREADS / 2u;
 var<workgroup> ranks: array<atomic<u32>, 4096>;
@@ -25,7 +32,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var word = lane; word < DIGITS * WORDS; word += SORT_THREADS) {
         atomicStore(&ranks[word], 0u);
     }
-    workgroupBarrier();
+    find_digit_starts(lane, SORT_THREADS);
     let first = block * SORT_BLOCK + lane * KEYS_PER_THREAD;
     let end = min(first + KEYS_PER_THREAD, n);
     let half = (lane % 2u) * 16u;
@@ -49,7 +56,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let key = keys[i];
         let digit = (key >> sort_pass.shift) & 255u;
         let before = atomicAdd(&ranks[digit * WORDS + lane / 2u], 1u << half);
-        let place = offsets[digit * n_blocks + block] + ((before >> half) & 65535u);
+        let place = digit_starts[digit] + offsets[digit * n_blocks + block] + ((before >> half) & 65535u);
         sorted_keys[place] = key;
         sorted_values[place] = values[i];
     }

@@ -10,8 +10,7 @@
 @group(0) @binding(1) var<storage, read> block_offsets: array<u32>;
 @group(0) @binding(2) var<storage, read_write> camera: Camera;
 @group(0) @binding(3) var<storage, read_write> n_visible: array<u32>;
-@group(0) @binding(4) var<storage, read_write> table_length: array<u32>;
-@group(0) @binding(5) var<storage, read_write> args: array<u32>;
+@group(0) @binding(4) var<storage, read_write> args: array<u32>;
 
 @compute @workgroup_size(1)
 fn main() {
@@ -19,7 +18,6 @@ fn main() {
     let n = select(block_offsets[n_blocks], 0u, camera.is_full != 0u);
     camera.n_visible = n;
     n_visible[0] = n;
-    table_length[0] = DIGITS * ((n + SORT_BLOCK - 1u) / SORT_BLOCK);
     write_args(ARGS_VISIBLE, n, 256u);
     write_args(ARGS_SORT_VISIBLE, n, SORT_BLOCK);
 }

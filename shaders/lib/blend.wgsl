@@ -6,6 +6,8 @@
 const MIN_TRANSMITTANCE: f32 = 1e-4;
 // A splat never hides all behind it: what it hides gets no gradient.
 const MAX_ALPHA: f32 = 0.99;
+// Rounding must not cut a visible pixel.
+const REACH_SLACK: f32 = 0.05;
 const LOG2_E: f32 = 1.4426950408889634;
 // Splats between two looks at whether all pixels have stopped.
 const SPLATS_PER_LOOK: u32 = 8u;
@@ -18,6 +20,8 @@ struct Ellipse {
     b: f32,
     half_c: f32,
     opacity: f32,
+    // Rows further from the centre see nothing of it, px.
+    reach: f32,
 }
 
 fn ellipse_of(splat: Projected, corner: vec2<f32>) -> Ellipse {
@@ -27,6 +31,7 @@ fn ellipse_of(splat: Projected, corner: vec2<f32>) -> Ellipse {
         -LOG2_E * splat.conic_b,
         -0.5 * LOG2_E * splat.conic_c,
         splat.opacity,
+        splat.extent_px.y + REACH_SLACK,
     );
 }
 

@@ -2,7 +2,7 @@
 
 var<workgroup> lane_values: array<vec4<f32>, 3u * LANES>;
 
-fn store_sums(place: u32, lane: u32, geometry: vec4<f32>, conic: vec4<f32>, color: vec4<f32>) {
+fn store_sums(begin: u32, place: u32, lane: u32, geometry: vec4<f32>, conic: vec4<f32>, color: vec4<f32>) {
     lane_values[lane] = geometry;
     lane_values[LANES + lane] = conic;
     lane_values[2u * LANES + lane] = color;
@@ -15,4 +15,8 @@ fn store_sums(place: u32, lane: u32, geometry: vec4<f32>, conic: vec4<f32>, colo
         keep(place, lane, sum);
     }
     workgroupBarrier();
+}
+
+// Nothing is left over: every instance was kept at once.
+fn finish_sums(begin: u32, end: u32, lane: u32) {
 }

@@ -9,6 +9,7 @@
 
 // Above it the noise is below 4e-9 of itself.
 const MAX_SHAKEN_OPACITY: f32 = 0.2;
+const PI: f32 = 3.14159265;
 
 struct Gradient {
     mean: vec3<f32>,
@@ -43,13 +44,18 @@ fn band_of(coefficient: u32) -> u32 {
     return 1u + select(0u, 1u, coefficient >= 3u) + select(0u, 1u, coefficient >= 8u);
 }
 
+fn sh_moment(half: u32, g: f32) -> f32 {
+    return BETA_1 * bitcast<f32>(half << 16u) + (1.0 - BETA_1) * g;
+}
+
 // All bands share their colour gradient; a band has one second moment, the mean over its coefficients and channels.
 // `since_cleared` counts the updates of the moments, `in_all` those of the splat and of what it was copied from.
 fn update_sh(splat_ix: u32, direction: vec3<f32>, g_color: vec3<f32>, since_cleared: u32, in_all: u32) {
     let stored = n_sh_rest(step.sh_stored);
     let words = (stored + 1u) / 2u;
     let first_word = splat_ix * (words + step.sh_stored);
-    var basis = sh_basis(direction);
+    // Of any band: the squares of its 2 band + 1 coefficients add up to (2 band + 1) / (4 pi) in every direction (Unsoeld 1927).
+    let mean = dot(g_color, g_color) / (12.0 * PI);
     var factors = vec3<f32>(0.0);
     var n_active = 0u;
     for (var band = 1u; band <= step.sh_degree; band += 1u) {
@@ -58,32 +64,34 @@ fn update_sh(splat_ix: u32, direction: vec3<f32>, g_color: vec3<f32>, since_clea
             break;
         }
         let correction = corrections(min(in_all - first_update + 1u, since_cleared));
-        let begin = band * band - 1u;
-        let end = begin + 2u * band + 1u;
-        var squares = 0.0;
-        for (var b = begin; b < end; b += 1u) {
-            squares += basis[b] * basis[b];
-        }
-        let mean = squares * dot(g_color, g_color) / f32(3u * (end - begin));
         let at = first_word + words + band - 1u;
         let v = BETA_2 * bitcast<f32>(sh_moments[at]) + (1.0 - BETA_2) * mean;
         sh_moments[at] = bitcast<u32>(v);
-        factors[band - 1u] = correction.x / (sqrt(v) * correction.y + SPLAT_EPS);
-        n_active = 3u * end;
+        factors[band - 1u] = step.lr_sh_rest * correction.x / (sqrt(v) * correction.y + SPLAT_EPS);
+        n_active = 3u * ((band + 1u) * (band + 1u) - 1u);
     }
-    for (var word = 0u; 2u * word < n_active; word += 1u) {
-        let packed = sh_moments[first_word + word];
-        var halves = vec2<u32>(packed & 0xffffu, packed >> 16u);
-        for (var half = 0u; half < 2u; half += 1u) {
-            let k = 2u * word + half;
-            if k < n_active {
-                let g = basis[k / 3u] * g_color[k % 3u];
-                let m = BETA_1 * bitcast<f32>(halves[half] << 16u) + (1.0 - BETA_1) * g;
-                halves[half] = bf16_of(m);
-                sh_rest[splat_ix * stored + k] -= step.lr_sh_rest * m * factors[band_of(k / 3u) - 1u];
-            }
+    let basis = sh_basis(direction);
+    let first = splat_ix * stored;
+    // Two numbers a word; written out, so that the basis stays in registers.
+#repeat w 22
+    if $[w+w]u < n_active {
+        let packed = sh_moments[first_word + $wu];
+        let m = sh_moment(packed & 0xffffu, basis[$[w+w]u / 3u] * g_color[$[w+w]u % 3u]);
+        sh_rest[first + $[w+w]u] -= m * factors[band_of($[w+w]u / 3u) - 1u];
+        var kept = packed & 0xffff0000u;
+        if $[w+w]u + 1u < n_active {
+            let odd = sh_moment(packed >> 16u, basis[($[w+w]u + 1u) / 3u] * g_color[($[w+w]u + 1u) % 3u]);
+            sh_rest[first + $[w+w]u + 1u] -= odd * factors[band_of(($[w+w]u + 1u) / 3u) - 1u];
+            kept = bf16_of(odd) << 16u;
         }
-        sh_moments[first_word + word] = halves.x | (halves.y << 16u);
+        sh_moments[first_word + $wu] = bf16_of(m) | kept;
+    }
+#end
+    if n_active == 45u {
+        let packed = sh_moments[first_word + 22u];
+        let m = sh_moment(packed & 0xffffu, basis[14] * g_color.z);
+        sh_rest[first + 44u] -= m * factors.z;
+        sh_moments[first_word + 22u] = bf16_of(m) | (packed & 0xffff0000u);
     }
 }
 

@@ -5,6 +5,7 @@
 #import shape
 #import projected
 #import blend
+#import batch
 #import lane_sum
 
 @group(0) @binding(0) var<uniform> step: Step;
@@ -41,33 +42,40 @@ fn walk_back(tile: u32, lane: u32) {
         }
     }
 #end
-    for (var k = begin; k < end; k += 1u) {
-        let splat = projected[instances[k]];
-        let ellipse = ellipse_of(splat, corner);
-        let payload = vec4<f32>(splat.red, splat.green, splat.blue, splat.depth);
-        // v_sigma times 1, dx, dy; dx^2, dx dy, dy^2; weight times the pixel's gradient.
-        var moments = vec3<f32>(0.0);
-        var squares = vec3<f32>(0.0);
-        var lights = vec4<f32>(0.0);
+    for (var first_of_batch = begin; first_of_batch < end; first_of_batch += BATCH) {
+        fetch_batch(first_of_batch, end, lane, corner);
+        workgroupBarrier();
+        let end_of_batch = min(first_of_batch + BATCH, end);
+        for (var k = first_of_batch; k < end_of_batch; k += 1u) {
+            let ellipse = ellipse_in_batch(k - first_of_batch);
+            let payload = payload_in_batch(k - first_of_batch);
+            // v_sigma times 1, dx, dy; dx^2, dx dy, dy^2; weight times the pixel's gradient.
+            var moments = vec3<f32>(0.0);
+            var squares = vec3<f32>(0.0);
+            var lights = vec4<f32>(0.0);
 #repeat i PIXELS
-        {
-            let d = ellipse.center - pixel_in_tile($iu, lane);
-            let raw = raw_alpha(ellipse, d);
-            let alpha = min(raw, MAX_ALPHA);
-            let next = t_$i * (1.0 - alpha);
-            let is_over = next <= MIN_TRANSMITTANCE;
-            let weight = select(alpha * t_$i, 0.0, is_over);
-            let worth = dot(payload, v_$i);
-            behind_$i -= weight * worth;
-            let v_alpha = t_$i * worth - behind_$i / (1.0 - alpha);
-            let v_sigma = select(-raw * v_alpha, 0.0, is_over || raw > MAX_ALPHA);
-            lights += weight * v_$i;
-            let v_d = v_sigma * d;
-            moments += vec3<f32>(v_sigma, v_d);
-            squares += vec3<f32>(v_d.x * d.x, v_d.x * d.y, v_d.y * d.y);
-            t_$i = select(next, -abs(t_$i), is_over);
-        }
+            let d_$i = ellipse.center - pixel_in_tile($iu, lane);
+            if abs(d_$i.y) <= ellipse.reach {
+                let d = d_$i;
+                let raw = raw_alpha(ellipse, d);
+                let alpha = min(raw, MAX_ALPHA);
+                let next = t_$i * (1.0 - alpha);
+                let is_over = next <= MIN_TRANSMITTANCE;
+                let weight = select(alpha * t_$i, 0.0, is_over);
+                let worth = dot(payload, v_$i);
+                behind_$i -= weight * worth;
+                let v_alpha = t_$i * worth - behind_$i / (1.0 - alpha);
+                let v_sigma = select(-raw * v_alpha, 0.0, is_over || raw > MAX_ALPHA);
+                lights += weight * v_$i;
+                let v_d = v_sigma * d;
+                moments += vec3<f32>(v_sigma, v_d);
+                squares += vec3<f32>(v_d.x * d.x, v_d.x * d.y, v_d.y * d.y);
+                t_$i = select(next, -abs(t_$i), is_over);
+            }
 #end
-        store_sums(k, lane, vec4<f32>(moments, lights.w), vec4<f32>(squares, 0.0), vec4<f32>(lights.xyz, 0.0));
+            store_sums(begin, k, lane, vec4<f32>(moments, lights.w), vec4<f32>(squares, 0.0), vec4<f32>(lights.xyz, 0.0));
+        }
+        workgroupBarrier();
     }
+    finish_sums(begin, end, lane);
 }

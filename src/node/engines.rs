@@ -77,5 +77,6 @@ fn open(kind: Kind, deterministic: bool) -> Result<Box<dyn Engine>, GpuError> {
         any_kind: kind == Kind::Gpu,
         subgroups: true,
         float_atomics: !deterministic,
+        lanes: None,
     })?))
 }

@@ -16,6 +16,7 @@ pub fn gpu_engine() -> WgpuEngine {
         any_kind: true,
         subgroups: true,
         float_atomics: false,
+        lanes: None,
     };
     WgpuEngine::new(wanted).unwrap_or_else(|error| panic!("run scripts/setup test: {error}"))
 }

@@ -3,7 +3,11 @@
 use crate::buffer::Buffer;
 use crate::device::Gpu;
 use crate::error::GpuError;
-use crate::kernel::{Kernel, SCAN_APPLY, SCAN_BLOCKS, SCAN_SUMS, SORT_COUNT, SORT_SCATTER};
+use crate::kernel::{
+    Kernel, SCAN_APPLY, SCAN_BLOCKS, SCAN_SUMS, SORT_COUNT, SORT_ROWS, SORT_SCATTER,
+    SORT_SCATTER_SUBGROUPS,
+};
+use crate::profile::MAX_TIMED;
 use crate::types::{SCAN_BLOCK, SORT_BLOCK, SortPass};
 
 /// Groups that one dimension of a dispatch may have.
@@ -15,18 +19,18 @@ pub struct Commands<'a> {
     gpu: &'a Gpu,
     encoder: wgpu::CommandEncoder,
     pass: Option<wgpu::ComputePass<'static>>,
+    /// Kernels between two timestamps each.
+    timed: Vec<&'static str>,
 }
 
 /// Buffers of prefix sums and sorts, for up to `max_keys` numbers.
 #[derive(Debug)]
 pub struct SortBuffers {
-    max_keys: u32,
     block_sums: Buffer,
     table: Buffer,
     offsets: Buffer,
     passes: Vec<Buffer>,
-    /// One word that visible_args and instance_args set to the length of the table.
-    pub table_length: Buffer,
+    totals: Buffer,
 }
 
 /// Keys with values, and room to sort them.
@@ -47,6 +51,7 @@ impl<'a> Commands<'a> {
             gpu,
             encoder,
             pass: None,
+            timed: Vec::new(),
         }
     }
 
@@ -128,22 +133,24 @@ impl<'a> Commands<'a> {
         for pass in &sort.passes[..n_passes] {
             let count = [pass, &pairs.keys, length, &sort.table];
             self.dispatch_indirect(&SORT_COUNT, &count, args, first_word)?;
-            let max_table = sort.max_table();
-            self.scan(
-                sort,
-                [&sort.table, &sort.table_length, &sort.offsets],
-                max_table,
-            )?;
+            let rows = [&sort.table, length, &sort.offsets, &sort.totals];
+            self.dispatch(&SORT_ROWS, &rows, 256)?;
             let scatter = [
                 pass,
                 &pairs.keys,
                 &pairs.values,
                 length,
                 &sort.offsets,
+                &sort.totals,
                 &pairs.spare_keys,
                 &pairs.spare_values,
             ];
-            self.dispatch_indirect(&SORT_SCATTER, &scatter, args, first_word)?;
+            let kernel = if SORT_SCATTER_SUBGROUPS.suits(self.gpu.lanes()) {
+                &SORT_SCATTER_SUBGROUPS
+            } else {
+                &SORT_SCATTER
+            };
+            self.dispatch_indirect(kernel, &scatter, args, first_word)?;
             std::mem::swap(&mut pairs.keys, &mut pairs.spare_keys);
             std::mem::swap(&mut pairs.values, &mut pairs.spare_values);
         }
@@ -152,7 +159,19 @@ impl<'a> Commands<'a> {
 
     pub fn submit(mut self) {
         self.pass = None;
+        let mut profile = self.gpu.profile.borrow_mut();
+        let Some(profile) = profile.as_mut().filter(|_| !self.timed.is_empty()) else {
+            self.gpu.queue.submit([self.encoder.finish()]);
+            return;
+        };
+        let n = 2 * self.timed.len();
+        self.encoder
+            .resolve_query_set(&profile.queries, 0..n as u32, &profile.ticks.raw, 0);
         self.gpu.queue.submit([self.encoder.finish()]);
+        // A device that is lost says so to whoever reads results next.
+        if let Ok(ticks) = self.gpu.read::<u64>(&profile.ticks, 0..n) {
+            profile.add(&self.timed, &ticks);
+        }
     }
 
     fn bind(
@@ -184,10 +203,25 @@ impl<'a> Commands<'a> {
                 })
         });
         let encoder = &mut self.encoder;
+        let profile = self.gpu.profile.borrow();
+        let queries = profile.as_ref().map(|profile| &profile.queries);
+        let mut timestamps = None;
+        if let Some(query_set) = queries.filter(|_| self.timed.len() < MAX_TIMED) {
+            self.pass = None;
+            let first = 2 * self.timed.len() as u32;
+            self.timed.push(kernel.name);
+            timestamps = Some(wgpu::ComputePassTimestampWrites {
+                query_set,
+                beginning_of_pass_write_index: Some(first),
+                end_of_pass_write_index: Some(first + 1),
+            });
+        }
         let pass = self.pass.get_or_insert_with(|| {
-            encoder
-                .begin_compute_pass(&wgpu::ComputePassDescriptor::default())
-                .forget_lifetime()
+            let descriptor = wgpu::ComputePassDescriptor {
+                label: None,
+                timestamp_writes: timestamps,
+            };
+            encoder.begin_compute_pass(&descriptor).forget_lifetime()
         });
         pass.set_pipeline(&pipeline.compute);
         pass.set_bind_group(0, &*group, &[]);
@@ -198,7 +232,6 @@ impl<'a> Commands<'a> {
 impl SortBuffers {
     pub fn new(gpu: &Gpu, max_keys: u32) -> Result<Self, GpuError> {
         let n_table = 256 * max_keys.div_ceil(SORT_BLOCK).max(1) as usize;
-        let max_scanned = n_table.max(max_keys as usize);
         let passes = [0, 8, 16, 24].map(|shift| {
             let pass = SortPass {
                 shift,
@@ -207,21 +240,17 @@ impl SortBuffers {
             gpu.uniform("sort_pass", &pass)
         });
         Ok(Self {
-            max_keys,
-            block_sums: gpu
-                .storage::<u32>("block_sums", max_scanned.div_ceil(SCAN_BLOCK as usize))?,
+            block_sums: gpu.storage::<u32>(
+                "block_sums",
+                (max_keys as usize).div_ceil(SCAN_BLOCK as usize),
+            )?,
             table: gpu.storage::<u32>("sort_table", n_table)?,
-            offsets: gpu.storage::<u32>("sort_offsets", n_table + 1)?,
+            offsets: gpu.storage::<u32>("sort_offsets", n_table)?,
             passes: passes.into(),
-            table_length: gpu.storage::<u32>("table_length", 1)?,
+            totals: gpu.storage::<u32>("sort_totals", 256)?,
         })
     }
-
-    fn max_table(&self) -> u32 {
-        256 * self.max_keys.div_ceil(SORT_BLOCK).max(1)
-    }
 }
-
 impl Pairs {
     pub fn new(gpu: &Gpu, max_pairs: usize) -> Result<Self, GpuError> {
         Ok(Self {

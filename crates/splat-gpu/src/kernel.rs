@@ -19,10 +19,19 @@ pub struct Kernel {
     pub source: &'static str,
     /// Files of `shaders/lib/` that it may import: (name in `#import`, text).
     pub libraries: &'static [(&'static str, &'static str)],
-    /// `None`: as wide as the lanes that a tile is given, see `Lanes`.
-    pub workgroup_size: Option<u32>,
+    pub threads: Threads,
     /// In order of the binding index: uniform first, then inputs, then outputs.
     pub bindings: &'static [(&'static str, Access)],
+}
+
+/// Threads of a workgroup.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Threads {
+    Fixed(u32),
+    /// The lanes that a tile is given.
+    Lanes,
+    /// So many subgroups: for adapters that have them.
+    Subgroups(u32),
 }
 
 /// Threads that share a tile of 256 pixels, and how they add up.
@@ -30,14 +39,17 @@ pub struct Kernel {
 pub struct Lanes {
     /// A divisor of 256.
     pub n: u32,
-    /// Whether they are one subgroup, whose sums need no workgroup memory.
-    pub are_subgroup: bool,
+    /// Lanes of a subgroup, a divisor of `n`; `None`: sums go through workgroup memory alone.
+    pub subgroup: Option<u32>,
 }
 
+/// Lanes that answer a ballot in one word.
+const MAX_BALLOT: u32 = 32;
 /// Pixels of a tile.
 const TILE_PIXELS: u32 = 256;
 
-/// A table of shaders, one entry per file: constant, file, threads of a workgroup (or `lanes`) and bindings. Also makes
+/// A table of shaders, one entry per file: constant, file, threads of a workgroup (or `lanes`, or `(8 subgroups)`)
+/// and bindings. Also makes
 /// `ALL`, every entry, and `LIBRARIES`, the files that they may import. `$folder` as seen from the file of the table.
 #[macro_export]
 macro_rules! kernels {
@@ -55,28 +67,37 @@ macro_rules! kernels {
             name: $name,
             source: include_str!(concat!($folder, $name, ".wgsl")),
             libraries: LIBRARIES,
-            workgroup_size: $crate::kernels!(@size $size),
+            threads: $crate::kernels!(@size $size),
             bindings: &[$((stringify!($binding), $crate::kernel::Access::$access)),*],
         };)*
         pub const ALL: &[&$crate::kernel::Kernel] = &[$(&$constant),*];
     };
     (@size lanes) => {
-        None
+        $crate::kernel::Threads::Lanes
+    };
+    (@size ($n:literal subgroups)) => {
+        $crate::kernel::Threads::Subgroups($n)
     };
     (@size $n:literal) => {
-        Some($n)
+        $crate::kernel::Threads::Fixed($n)
     };
 }
 
 crate::kernels! {
     folder "../shaders/";
-    libraries ["flat", "scanning", "sorting"];
-    SCAN_SUMS "scan_sums" 64 [numbers Read, length Read, block_sums ReadWrite];
-    SCAN_BLOCKS "scan_blocks" 64 [length Read, block_sums ReadWrite];
-    SCAN_APPLY "scan_apply" 64 [numbers Read, length Read, block_sums Read, sums_before ReadWrite];
-    SORT_COUNT "sort_count" 32 [sort_pass Uniform, keys Read, length Read, table ReadWrite];
+    libraries ["digit_starts", "flat", "scanning", "sorting"];
+    SCAN_SUMS "scan_sums" 256 [numbers Read, length Read, block_sums ReadWrite];
+    SCAN_BLOCKS "scan_blocks" 256 [length Read, block_sums ReadWrite];
+    SCAN_APPLY "scan_apply" 256 [numbers Read, length Read, block_sums Read, sums_before ReadWrite];
+    SORT_COUNT "sort_count" 256 [sort_pass Uniform, keys Read, length Read, table ReadWrite];
+    SORT_ROWS "sort_rows" 32 [table Read, length Read, offsets ReadWrite, totals ReadWrite];
     SORT_SCATTER "sort_scatter" 32 [
-        sort_pass Uniform, keys Read, values Read, length Read, offsets Read, sorted_keys ReadWrite, sorted_values ReadWrite,
+        sort_pass Uniform, keys Read, values Read, length Read, offsets Read, totals Read, sorted_keys ReadWrite,
+        sorted_values ReadWrite,
+    ];
+    SORT_SCATTER_SUBGROUPS "sort_scatter_subgroups" (8 subgroups) [
+        sort_pass Uniform, keys Read, values Read, length Read, offsets Read, totals Read, sorted_keys ReadWrite,
+        sorted_values ReadWrite,
     ];
 }
 
@@ -88,15 +109,31 @@ impl Kernel {
         import(self.source, self.libraries, lanes, &mut imported, &mut text)?;
         let pixels = TILE_PIXELS / lanes.n;
         let text = repeated(&text, pixels)?;
-        if !text.contains("LANES") {
+        if !text.contains("LANES") && !text.contains("SUBGROUP") {
             return Some(text);
         }
-        Some(format!("const LANES: u32 = {}u;\n{text}", lanes.n))
+        let subgroup = lanes.subgroup.unwrap_or(lanes.n);
+        Some(format!(
+            "const LANES: u32 = {}u;\nconst SUBGROUP: u32 = {subgroup}u;\n{text}",
+            lanes.n
+        ))
     }
 
     /// Threads of a workgroup.
     pub fn width(&self, lanes: Lanes) -> u32 {
-        self.workgroup_size.unwrap_or(lanes.n)
+        match self.threads {
+            Threads::Fixed(n) => n,
+            Threads::Lanes => lanes.n,
+            Threads::Subgroups(n) => n * lanes.subgroup.unwrap_or(lanes.n),
+        }
+    }
+
+    /// Whether adapters with these lanes can run it.
+    pub fn suits(&self, lanes: Lanes) -> bool {
+        match self.threads {
+            Threads::Subgroups(_) => lanes.subgroup.is_some_and(|n| n <= MAX_BALLOT),
+            Threads::Fixed(_) | Threads::Lanes => true,
+        }
     }
 }
 
@@ -114,9 +151,10 @@ fn import(
             text.push('\n');
             continue;
         };
-        let name = match (name.trim(), lanes.are_subgroup) {
-            ("lane_sum", true) => "lane_sum_subgroup",
-            ("lane_sum", false) => "lane_sum_shared",
+        let name = match (name.trim(), lanes.subgroup) {
+            ("lane_sum", Some(n)) if n == lanes.n => "lane_sum_subgroup",
+            ("lane_sum", Some(_)) => "lane_sum_subgroups",
+            ("lane_sum", None) => "lane_sum_shared",
             (name, _) => name,
         };
         if imported.insert(name.to_owned()) {

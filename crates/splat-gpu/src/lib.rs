@@ -11,6 +11,8 @@ mod fault;
 
 pub mod kernel;
 
+pub mod profile;
+
 pub mod device;
 
 pub mod types;

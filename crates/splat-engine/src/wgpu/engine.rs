@@ -69,6 +69,11 @@ impl WgpuEngine {
         self.gpu.has_float_atomics()
     }
 
+    /// What it runs on: to profile its kernels.
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
     /// As when the adapter is unplugged: for tests.
     pub fn lose_device(&self) {
         self.gpu.lose();

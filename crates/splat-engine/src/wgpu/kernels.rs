@@ -5,6 +5,7 @@ splat_gpu::kernels! {
     libraries [
         "adam",
         "appearance",
+        "batch",
         "blend",
         "camera",
         "cleared",
@@ -13,6 +14,7 @@ splat_gpu::kernels! {
         "groups",
         "lane_sum_shared",
         "lane_sum_subgroup",
+        "lane_sum_subgroups",
         "mlp",
         "mlp_update",
         "moves",
@@ -34,7 +36,7 @@ splat_gpu::kernels! {
     VIEW_CAMERA "view_camera" 64 [step Uniform, views ReadWrite, network Read, camera ReadWrite];
     CULL "cull" 256 [step Uniform, camera Read, geometry Read, visible_bits ReadWrite, block_counts ReadWrite];
     VISIBLE_ARGS "visible_args" 1 [
-        step Uniform, block_offsets Read, camera ReadWrite, n_visible ReadWrite, table_length ReadWrite, args ReadWrite,
+        step Uniform, block_offsets Read, camera ReadWrite, n_visible ReadWrite, args ReadWrite,
     ];
     PROJECT "project" 256 [
         step Uniform, camera Read, geometry Read, sh_rest Read, visible_bits Read, block_offsets Read,
@@ -42,7 +44,7 @@ splat_gpu::kernels! {
     ];
     TILE_COUNTS "tile_counts" 256 [camera Read, depth_order Read, projected Read, counts ReadWrite];
     INSTANCE_ARGS "instance_args" 1 [
-        step Uniform, first_instances Read, camera ReadWrite, n_instances ReadWrite, table_length ReadWrite,
+        step Uniform, first_instances Read, camera ReadWrite, n_instances ReadWrite,
         args ReadWrite,
     ];
     EMIT "emit" 256 [

@@ -44,7 +44,6 @@ pub(crate) fn forward(
         &s.first_instances,
         &frame.camera,
         &frame.n_instances,
-        &i.sort.table_length,
         &frame.args,
     ];
     commands.dispatch(&INSTANCE_ARGS, &instance_args, 1)?;
@@ -117,7 +116,6 @@ fn find_visible(
         &s.block_offsets,
         &frame.camera,
         &frame.n_visible,
-        &s.sort.table_length,
         &frame.args,
     ];
     commands.dispatch(&VISIBLE_ARGS, &visible_args, 1)?;

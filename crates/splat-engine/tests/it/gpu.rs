@@ -19,6 +19,7 @@ pub fn gpu_engine(subgroups: bool) -> WgpuEngine {
         any_kind: true,
         subgroups,
         float_atomics: false,
+        lanes: None,
     })
 }
 
@@ -28,6 +29,7 @@ pub fn fast_engine() -> WgpuEngine {
         any_kind: true,
         subgroups: true,
         float_atomics: true,
+        lanes: None,
     })
 }
 
@@ -61,17 +63,30 @@ fn sums_in_any_order_are_the_same_but_for_rounding() {
         );
         return;
     }
+    assert_rounding_alone(&mut fast);
+}
+
+/// As on adapters with subgroups of 32, which share a tile by two.
+#[test]
+fn sums_over_several_subgroups_a_tile_are_the_same_but_for_rounding() {
+    for lanes in [16, 64, 256] {
+        assert_rounding_alone(&mut opened(Wanted {
+            any_kind: true,
+            subgroups: true,
+            float_atomics: false,
+            lanes: Some(lanes),
+        }));
+    }
+}
+
+/// Beside the engine whose tiles are one subgroup on lavapipe.
+fn assert_rounding_alone(engine: &mut WgpuEngine) {
     for seed in 0..4 {
         let scene = random::scene(seed, &ORDINARY);
         let settings = random::settings();
         let exact = gpu_gradients(true, &scene.splats, &scene.view, &settings);
-        let found = gradients::gradients(
-            &mut fast,
-            &scene.splats,
-            &scene.view,
-            [[0.0; 3]; 2],
-            &settings,
-        );
+        let found =
+            gradients::gradients(engine, &scene.splats, &scene.view, [[0.0; 3]; 2], &settings);
         let found = found.unwrap();
         let pairs = [
             (found.means.as_flattened(), exact.means.as_flattened()),

@@ -58,6 +58,7 @@ fn wanted(any_kind: bool) -> Wanted {
         any_kind,
         subgroups: true,
         float_atomics: false,
+        lanes: None,
     }
 }
 

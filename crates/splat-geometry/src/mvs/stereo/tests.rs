@@ -112,6 +112,7 @@ const ANY_KIND: Wanted = Wanted {
     any_kind: true,
     subgroups: true,
     float_atomics: false,
+    lanes: None,
 };
 
 fn opened() -> GpuMatcher {
