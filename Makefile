@@ -1,5 +1,5 @@
 # The lines that people and CI run. `make demo` and `make test` install what is missing first.
-.PHONY: demo test lint zenoh-test formats-test viewer-test layouts-test v4l2-test record-kill-test bench live-bench ablation soak onnx-test ros2-test setup
+.PHONY: demo test lint zenoh-test formats-test viewer-test layouts-test v4l2-test record-kill-test bench gpu-bench live-bench ablation soak onnx-test ros2-test setup
 
 # Maps the shipped recording and compares the poses with its ground truth. Look at out/demo/report.html.
 demo:
@@ -50,6 +50,11 @@ record-kill-test:
 live-bench:
 	cargo build --release --locked
 	scripts/live_bench $(NAMES)
+
+# On a machine with a GPU: its report, out/gpu_bench/report.md.
+gpu-bench:
+	scripts/setup test
+	scripts/gpu_bench
 
 # Figures for docs/BENCHMARKS.md: every stage and the whole step, sizes in the names.
 bench:
