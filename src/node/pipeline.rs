@@ -78,7 +78,9 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
     }
 }
 
-fn run_once(job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
+fn run_once(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
+    let n_photos = job.source.n_photos();
+    job.params.select = job.params.select.for_photos(n_photos);
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
     run_with(model, scale, job, on_progress)
 }

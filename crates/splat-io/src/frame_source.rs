@@ -65,6 +65,12 @@ pub trait Source: Send {
     /// Frames still to come, where the source knows (for the progress bar).
     fn len_hint(&self) -> Option<u64>;
 
+    /// Images still to come, where somebody chose each of them: photos in a folder or in a scene of another program. `None` for
+    /// the frames of a camera, recorded or not, which repeat themselves.
+    fn n_photos(&self) -> Option<u64> {
+        None
+    }
+
     /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
     fn truth_extent(&self) -> Option<f64>;
 

@@ -284,6 +284,10 @@ impl Source for ImagesSource {
         })
     }
 
+    fn n_photos(&self) -> Option<u64> {
+        self.len_hint()
+    }
+
     fn truth_extent(&self) -> Option<f64> {
         self.truth_extent
     }
