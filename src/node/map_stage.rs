@@ -133,6 +133,12 @@ impl SelectStage {
         }
     }
 
+    /// Of a source of so many photos; `None` for the frames of a camera.
+    pub(crate) fn of_photos(mut self, n_photos: Option<u64>) -> Self {
+        self.selector = self.selector.of_photos(n_photos);
+        self
+    }
+
     pub(crate) fn push(&mut self, frame: Frame) -> Option<Batch> {
         if self.frame_stamps.len() < MAX_STAMPS {
             self.frame_stamps.push(frame.stamp);

@@ -78,9 +78,7 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
     }
 }
 
-fn run_once(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
-    let n_photos = job.source.n_photos();
-    job.params.select = job.params.select.for_photos(n_photos);
+fn run_once(job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
     let (model, scale) = model(&job.params, job.source.truth_extent())?;
     run_with(model, scale, job, on_progress)
 }
@@ -109,7 +107,8 @@ fn run_with(
         .unzip();
     let stages = Stages {
         map,
-        select: SelectStage::new(&job.params, first_id, handles.as_ref()),
+        select: SelectStage::new(&job.params, first_id, handles.as_ref())
+            .of_photos(job.source.n_photos()),
         geometry: GeometryStage::new(model, &job.params),
         track: track.received(live.is_some()),
         source: SourceStage::new(job.source, job.stop, handles),

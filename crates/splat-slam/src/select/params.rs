@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 pub struct SelectParams {
     /// Every frame becomes a keyframe.
     pub every_frame: bool,
-    /// So does every image of a folder, or of a scene of another program, that has at most so many: somebody chose them,
-    /// and what a choice of keyframes leaves out of few is missing in the map; 0 = off.
+    /// So does every image of a folder, or of a scene of another program, that has at most so many, unless it repeats the
+    /// one before: somebody chose them, and what is left out of few is missing in the map; 0 = off.
     #[schemars(range(min = 0, max = 1000000))]
     pub every_photo_up_to: u64,
     /// Every n-th frame that the source brings becomes a keyframe that is kept out of optimisation to measure
@@ -55,33 +55,5 @@ impl Default for SelectParams {
             batch_size: 8,
             batch_overlap: 3,
         }
-    }
-}
-
-impl SelectParams {
-    /// With every frame as a keyframe where a source of `n_photos` is to give all.
-    #[must_use]
-    pub fn for_photos(mut self, n_photos: Option<u64>) -> Self {
-        self.every_frame |= n_photos.is_some_and(|n| n <= self.every_photo_up_to);
-        self
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn few_photos_are_all_keyframes_and_frames_of_a_camera_are_chosen() {
-        let takes_all = |n| SelectParams::default().for_photos(n).every_frame;
-        assert_eq!(
-            [Some(1), Some(100), Some(101), None].map(takes_all),
-            [true, true, false, false]
-        );
-        let off = SelectParams {
-            every_photo_up_to: 0,
-            ..SelectParams::default()
-        };
-        assert!(!off.for_photos(Some(5)).every_frame);
     }
 }

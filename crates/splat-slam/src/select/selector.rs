@@ -24,6 +24,8 @@ const MAX_RETURN_PX: f32 = 1.5;
 /// Corners are followed at most so often: between images that are closer together they hardly move, and following them takes time
 /// that poses need.
 const MAX_FOLLOWED_HZ: f64 = 21.0;
+/// Of the motion that makes a keyframe of a camera's frame: a photo with less is the last one again.
+const REPEATED_SHARE: f64 = 0.125;
 /// Frames whose median sharpness is the measure.
 const SHARPNESS_WINDOW: usize = 15;
 
@@ -32,6 +34,8 @@ const SHARPNESS_WINDOW: usize = 15;
 pub struct Selector {
     params: SelectParams,
     next_id: u32,
+    /// Somebody chose the images: all but repetitions are keyframes.
+    takes_photos: bool,
     last: Option<LastKeyframe>,
     sharpness: VecDeque<f32>,
 }
@@ -73,6 +77,7 @@ impl Selector {
         Self {
             params,
             next_id: 0,
+            takes_photos: false,
             last: None,
             sharpness: VecDeque::new(),
         }
@@ -85,13 +90,40 @@ impl Selector {
         self
     }
 
+    /// Of a source of so many photos; `None` for the frames of a camera.
+    #[must_use]
+    pub fn of_photos(mut self, n_photos: Option<u64>) -> Self {
+        self.takes_photos = n_photos.is_some_and(|n| n <= self.params.every_photo_up_to);
+        self
+    }
+
     /// Returns the frame as a keyframe when the map should keep it.
     pub fn push(&mut self, mut frame: Frame) -> Option<Keyframe> {
         let every = self.params.holdout_frames;
         frame.is_held_out |= every > 0 && frame.seq % every == every / 2;
         // Held-out frames come besides: those that the map learns from stay nearly the same without them.
-        let is_kept = self.params.every_frame || self.shows_more(&frame) || frame.is_held_out;
+        let is_kept = self.params.every_frame
+            || (self.takes_photos && self.is_new_photo(&frame))
+            || (!self.takes_photos && self.shows_more(&frame))
+            || frame.is_held_out;
         is_kept.then(|| self.keep(frame))
+    }
+
+    /// Whether a photo is not the last one again, as of a camera at rest; it then takes that one's place.
+    fn is_new_photo(&mut self, frame: &Frame) -> bool {
+        let grey = small_grey(&frame.image);
+        let is_new = match self.last.as_mut().map(|last| last.follow(grey.clone())) {
+            Some(Motion::Measured { flow, parallax }) => {
+                let params = &self.params;
+                let share = (flow / params.min_flow).max(parallax / params.min_parallax);
+                share >= REPEATED_SHARE
+            }
+            None | Some(Motion::Lost | Motion::Unknown) => true,
+        };
+        if is_new && !frame.is_held_out {
+            self.last = Some(LastKeyframe::new(frame.stamp.secs(), grey));
+        }
+        is_new
     }
 
     /// Whether the frame shows enough that the last keyframe does not; it then takes that one's place.

@@ -218,3 +218,22 @@ fn a_faster_camera_gives_the_same_keyframes_and_is_not_followed_more_often() {
     assert_eq!(followed(15), 30, "each frame");
     assert_eq!(followed(60), 40, "every third");
 }
+
+#[test]
+fn all_of_few_photos_are_keyframes_but_not_the_same_one_again() {
+    // 4 px is less than a frame of a camera needs; the last three are one photo.
+    let shifts = [0.0, 4.0, 90.0, 200.0, 200.0, 200.3];
+    let kept_of = |n_photos| {
+        let mut selector = Selector::new(params()).of_photos(n_photos);
+        let frames = shifts.iter().zip(0..);
+        frames
+            .filter_map(|(shift, seq)| selector.push(frame(seq, *shift, 1.0)))
+            .map(|k| k.frame.seq)
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(kept_of(Some(6)), [0, 1, 2, 3]);
+    assert_eq!(kept_of(Some(100)), [0, 1, 2, 3]);
+    let of_a_camera = kept_of(None);
+    assert!(of_a_camera.len() < 4, "{of_a_camera:?}");
+    assert_eq!(kept_of(Some(101)), of_a_camera);
+}
