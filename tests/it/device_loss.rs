@@ -384,7 +384,7 @@ fn a_node_goes_on_within_seconds_when_its_gpu_is_lost_for_real() {
                 (None, _) => Box::new(Hooked {
                     inner: gpu_engine(),
                     hooks: Unplugged {
-                        at: 120,
+                        at: 80,
                         n_calls: AtomicU64::new(0),
                         since: Arc::clone(&lost),
                     },

@@ -323,6 +323,7 @@ fn homes() -> BTreeMap<&'static str, &'static [&'static str]> {
             &["crates/splat-io/", "crates/splat-ros/src/mcap_transport"][..],
         ),
         ("zenoh", &["crates/splat-ros/src/zenoh/"][..]),
+        ("foxglove", &["crates/splat-ros/src/foxglove_transport"][..]),
         (
             "cdr_encoding",
             &[

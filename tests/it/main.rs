@@ -22,6 +22,7 @@ mod eval_lines;
 mod exports;
 mod exposure;
 mod formats;
+mod foxglove;
 mod gpu_runs;
 mod graphs;
 mod ground_truth;

@@ -25,6 +25,11 @@ pub enum PublishError {
     #[cfg(feature = "ros2")]
     #[error("cannot send {topic:?} over ROS 2: {reason}")]
     Ros2 { topic: &'static str, reason: String },
+    #[cfg(feature = "foxglove")]
+    #[error(
+        "cannot serve Foxglove on {address}: {reason}; publish.foxglove takes an address and a port that is free"
+    )]
+    Foxglove { address: String, reason: String },
     #[error("cannot record what goes out: {reason}: {}", path.display())]
     Record { reason: String, path: PathBuf },
     #[error(transparent)]

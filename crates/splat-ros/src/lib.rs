@@ -10,6 +10,9 @@ pub mod params;
 
 pub mod navigation;
 
+#[cfg(feature = "foxglove")]
+mod foxglove_transport;
+
 mod mcap_transport;
 
 pub mod slew;

@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use crate::error::PublishError;
+#[cfg(feature = "foxglove")]
+use crate::foxglove_transport::FoxgloveTransport;
 use crate::latched::{self, LatchedStore};
 use crate::map_stream::{self, MapStream};
 use crate::mcap_transport::McapTransport;
@@ -99,6 +101,21 @@ impl Output {
                 found: "true".to_owned(),
                 expected: "false, since this build has no zenoh; build with --features zenoh"
                     .to_owned(),
+            });
+        }
+        #[cfg(feature = "foxglove")]
+        if !params.foxglove.is_empty() {
+            let transport = FoxgloveTransport::open(&params.foxglove, &params.namespace)?;
+            transports.push(Box::new(transport));
+        }
+        #[cfg(not(feature = "foxglove"))]
+        if !params.foxglove.is_empty() {
+            return Err(PublishError::Param {
+                name: "foxglove",
+                found: params.foxglove.clone(),
+                expected:
+                    "nothing, since this build has no Foxglove; build with --features foxglove"
+                        .to_owned(),
             });
         }
         if !params.record.is_empty() {

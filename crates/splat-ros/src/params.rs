@@ -22,6 +22,9 @@ pub struct PublishParams {
     pub domain_id: u32,
     /// Second element of every key, the node's name.
     pub namespace: String,
+    /// Address that Foxglove connects to for all topics, for example 127.0.0.1:8765. Who reaches it reads everything and can
+    /// command nothing; empty = none.
+    pub foxglove: String,
     /// MCAP file that all outgoing messages are written to; empty = none.
     pub record: String,
     /// Address that the viewer's page is served on, for example 127.0.0.1:8642; 0.0.0.0:8642 for other machines; empty = none.
@@ -94,6 +97,7 @@ impl Default for PublishParams {
             scouting: true,
             domain_id: 0,
             namespace: "splat_mapper".to_owned(),
+            foxglove: String::new(),
             record: String::new(),
             view: String::new(),
             view_token: String::new(),
