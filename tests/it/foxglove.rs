@@ -191,3 +191,56 @@ fn a_client_that_never_reads_holds_nobody_up() {
     }
     publisher.close().unwrap();
 }
+
+/// All strings of a JSON value that name a topic of ours, as far as it has a name of its own.
+fn topics_in(value: &Value, found: &mut Vec<String>) {
+    let mut note = |text: &str| {
+        if text.starts_with("/splat_mapper/") || text == "/diagnostics" {
+            found.push(text.to_owned());
+        }
+    };
+    match value {
+        Value::String(text) => note(text),
+        Value::Array(values) => values.iter().for_each(|value| topics_in(value, found)),
+        Value::Object(fields) => {
+            fields.keys().for_each(|key| note(key));
+            fields.values().for_each(|value| topics_in(value, found));
+        }
+        _ => {}
+    }
+}
+
+fn panels_in(layout: &Value, found: &mut Vec<String>) {
+    match layout {
+        Value::String(panel) => found.push(panel.clone()),
+        _ => ["first", "second"]
+            .iter()
+            .for_each(|side| panels_in(&layout[side], found)),
+    }
+}
+
+#[test]
+fn the_layout_that_is_shipped_shows_topics_and_fields_that_there_are() {
+    let text = std::fs::read_to_string("launch/foxglove_layout.json").unwrap();
+    let layout: Value = serde_json::from_str(&text).unwrap();
+    let mut panels = Vec::new();
+    panels_in(&layout["layout"], &mut panels);
+    panels.sort();
+    let configured: Vec<&String> = layout["configById"].as_object().unwrap().keys().collect();
+    assert_eq!(panels.iter().collect::<Vec<_>>(), configured);
+    let mut named = Vec::new();
+    topics_in(&layout["configById"], &mut named);
+    assert!(named.len() > 8, "{named:?}");
+    for name in named {
+        let name = name.strip_prefix("/splat_mapper/").unwrap_or(&name);
+        let (topic, field) = name.split_once('.').unwrap_or((name, ""));
+        let all = topics();
+        let topic = all.iter().find(|t| t.name == topic);
+        let topic = topic.unwrap_or_else(|| panic!("no topic {name}"));
+        let has_field = topic
+            .definition
+            .lines()
+            .any(|line| line.split_whitespace().nth(1) == Some(field));
+        assert!(field.is_empty() || has_field, "no field {name}");
+    }
+}

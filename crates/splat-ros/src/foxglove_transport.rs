@@ -173,7 +173,7 @@ impl Transport for FoxgloveTransport {
 
     fn close(&self) -> Result<(), PublishError> {
         let mut server = self.server.lock().unwrap_or_else(PoisonError::into_inner);
-        // Clients are told by its tasks, on the runtime of the server: nothing here waits for one that does not read.
+        // Its tasks say goodbye to clients, on the runtime of the server: nothing here waits for one that does not read.
         if let Some(server) = server.take() {
             server.stop().detach_all();
         }
