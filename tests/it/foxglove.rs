@@ -98,14 +98,18 @@ fn sample(topic: &'static Topic, n: u8) -> Sample {
     }
 }
 
-#[test]
-fn foxglove_gets_all_topics_and_what_was_latched_before_it_came() {
+fn served() -> Output {
     let params = PublishParams {
         foxglove: "127.0.0.1:0".to_owned(),
         namespace: "robot".to_owned(),
         ..PublishParams::default()
     };
-    let output = Output::open(&params, Vec::new()).unwrap();
+    Output::open(&params, Vec::new()).unwrap()
+}
+
+#[test]
+fn foxglove_gets_all_topics_and_what_was_latched_before_it_came() {
+    let output = served();
     let publisher = &output.handles.publisher;
     let address = publisher.endpoints().pop().unwrap();
     let all = topics();
@@ -169,12 +173,7 @@ fn a_foxglove_address_of_no_use_is_an_error_that_says_what_is_expected() {
 
 #[test]
 fn a_client_that_never_reads_holds_nobody_up() {
-    let params = PublishParams {
-        foxglove: "127.0.0.1:0".to_owned(),
-        namespace: "robot".to_owned(),
-        ..PublishParams::default()
-    };
-    let output = Output::open(&params, Vec::new()).unwrap();
+    let output = served();
     let publisher = &output.handles.publisher;
     let topic = topics().into_iter().find(|t| t.name == "cloud").unwrap();
     publisher.send(&sample(topic, 1)).unwrap();

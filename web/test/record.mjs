@@ -6,11 +6,11 @@ import { createInterface } from "node:readline";
 import { launch, settled } from "./look.mjs";
 
 const [program, recording, out] = process.argv.slice(2);
-const SIZE = { width: 960, height: 600 };
+const SIZE = { width: 720, height: 450 };
 // Of the growing map, one each so many milliseconds and no more; then of the flight through it.
 const EVERY_MS = 1500;
 const MOST_GROWING = 60;
-const FLIGHT = 36;
+const FLIGHT = 24;
 
 rmSync(out, { recursive: true, force: true });
 mkdirSync(`${out}/frames`, { recursive: true });
@@ -39,6 +39,11 @@ await page.setViewport(SIZE);
 await page.emulateMediaFeatures([{ name: "prefers-color-scheme", value: "dark" }]);
 await page.goto(url);
 await page.waitForFunction(() => window.splatMapper?.nSplats() > 0, { timeout: 120000 });
+
+// Its figures are too small to read in the recording.
+await page.evaluate(() => {
+  [...document.querySelectorAll("button")].find((button) => button.textContent === "Panel")?.click();
+});
 
 let n = 0;
 async function shoot() {
