@@ -89,8 +89,14 @@ async function live(browser) {
   check(found.n > 1000 && found.n === report.splats, "the page holds the splats of the report");
   check(found.errors.length === 0 && page.faults.length === 0, `no error on the page: ${[...found.errors, ...page.faults].join("; ")}`);
   await page.evaluate(() => window.splatMapper.disconnect());
-  await sleep(1000);
+  await sleep(30000);
+  const began = Date.now();
   await page.evaluate(() => window.splatMapper.reconnect());
+  const same = (hash, n) => String(window.splatMapper.hash()) === hash && window.splatMapper.nSplats() === n;
+  await page.waitForFunction(same, { timeout: 60000 }, String(found.hash), found.n).catch(() => {});
+  const millis = Date.now() - began;
+  console.log(`     equal again ${millis} ms after a break of 30 s`);
+  check(millis < 9000, "the page is equal again soon after a break (3 s are the aim on an idle machine)");
   const again = await calm(page);
   check(String(again.hash) === String(found.hash) && again.n === found.n, "after a break the page holds the same");
   await page.close();
