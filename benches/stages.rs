@@ -6,12 +6,10 @@
 //! which may be software, and in maps of which most lies behind the camera. Depth of a view on both.
 
 use std::hint::black_box;
-use std::sync::Arc;
 use std::time::Duration;
 
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput, criterion_group, criterion_main};
-use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
@@ -19,8 +17,6 @@ use splat_engine::cpu::engine::CpuEngine;
 use splat_engine::cpu::project_backward::{Forward, SplatGradients, project_backward};
 use splat_engine::cpu::raster_backward::{InstanceGradients, raster_backward};
 use splat_engine::cpu::{bin, loss, loss_buffers, project, raster};
-use splat_engine::loss_weights::LossWeights;
-use splat_engine::settings::{PoseMode, StepSettings};
 use splat_engine::traits::{Engine, SplatBuffers as _, Trainer as _, ViewStore as _};
 use splat_engine::view::TrainingView;
 use splat_engine::wgpu::engine::WgpuEngine;
@@ -33,15 +29,14 @@ use splat_geometry::mvs::stereo;
 use splat_geometry::mvs::view::MvsView;
 use splat_gpu::device::Wanted;
 use splat_mapper::params::settings::Settings;
-use splat_types::camera::Intrinsics;
-use splat_types::depth::DepthMap;
-use splat_types::image::RgbImage;
 use splat_types::splats::splats::Splats;
-use splat_types::transform::Rigid;
 
-const WIDTH_PX: u32 = 270;
-const HEIGHT_PX: u32 = 480;
-const FOCAL_PX: f64 = 350.0;
+#[path = "../examples/gpu_bench/scene.rs"]
+mod scene;
+
+use scene::{mvs_view, scene, settings};
+
+const SIZE: [u32; 2] = [270, 480];
 
 /// Name, number of splats, and the mean size that gives the wanted splats per tile.
 const SIZES: [(&str, usize, f64); 3] = [
@@ -63,7 +58,7 @@ criterion_main!(benches);
 
 fn stages(c: &mut Criterion) {
     for (name, n, size_px) in SIZES {
-        let (splats, view) = scene(n, size_px);
+        let (splats, view) = scene(n, size_px, SIZE);
         let mut group = c.benchmark_group("step");
         configure(&mut group);
         let mut engine = CpuEngine::new();
@@ -97,7 +92,7 @@ fn gpu_steps(c: &mut Criterion) {
             let Ok(mut engine) = WgpuEngine::new(wanted) else {
                 return;
             };
-            let (splats, view) = scene(n, size_px);
+            let (splats, view) = scene(n, size_px, SIZE);
             bench_step(
                 c,
                 &format!("step_{kind}"),
@@ -113,8 +108,8 @@ fn gpu_steps(c: &mut Criterion) {
 /// 10,000 splats in view, and in all as many as named.
 fn maps(c: &mut Criterion) {
     for (name, n) in MAPS {
-        let (seen, view) = scene(SIZES[0].1, SIZES[0].2);
-        let (mut unseen, _) = scene(n - seen.len(), SIZES[0].2);
+        let (seen, view) = scene(SIZES[0].1, SIZES[0].2, SIZE);
+        let (mut unseen, _) = scene(n - seen.len(), SIZES[0].2, SIZE);
         unseen.means.iter_mut().for_each(|[.., z]| *z = -*z);
         let all = [seen, unseen];
         let mut engine = CpuEngine::new();
@@ -135,7 +130,9 @@ fn maps(c: &mut Criterion) {
 fn sweeps(c: &mut Criterion) {
     let mut params = Settings::shipped().params().expect("shipped").mvs;
     (params.depth_planes, params.source_views) = (96, 4);
-    let views: Vec<MvsView> = (0..5).map(|ix| noise_view(0.1 * f64::from(ix))).collect();
+    let views: Vec<MvsView> = (0..5)
+        .map(|ix| mvs_view([320, 240], 0.1 * f64::from(ix)))
+        .collect();
     let sources: Vec<&MvsView> = views[1..].iter().collect();
     let range = (1.0, 6.0);
     let mut group = c.benchmark_group("sweep_320x240x96_4_sources");
@@ -156,29 +153,6 @@ fn sweeps(c: &mut Criterion) {
         });
     }
     group.finish();
-}
-
-/// Of noise: matching takes as long whatever there is to see.
-fn noise_view(x: f64) -> MvsView {
-    let (width_px, height_px) = (320, 240);
-    let mut rng = Pcg32::seed_from_u64(3);
-    let pixels = (0..3 * width_px * height_px).map(|_| rng.random());
-    MvsView {
-        image: Arc::new(RgbImage {
-            width_px,
-            height_px,
-            pixels: pixels.collect(),
-        }),
-        intrinsics: Intrinsics {
-            width_px,
-            height_px,
-            fx: 300.0,
-            fy: 300.0,
-            cx: 160.0,
-            cy: 120.0,
-        },
-        submap_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
-    }
 }
 
 fn features(c: &mut Criterion) {
@@ -269,7 +243,7 @@ fn each_stage(c: &mut Criterion, name: &str, splats: &Splats, view: &TrainingVie
     });
     let visible = &projected.splats;
     bench("bin", &mut || {
-        bin::bin(visible, WIDTH_PX, HEIGHT_PX, &mut tiles);
+        bin::bin(visible, SIZE[0], SIZE[1], &mut tiles);
     });
     bench("raster", &mut || {
         raster::raster(visible, &tiles, &mut image);
@@ -306,82 +280,4 @@ fn configure(group: &mut BenchmarkGroup<'_, WallTime>) {
         .sample_size(20)
         .warm_up_time(Duration::from_secs(1))
         .measurement_time(Duration::from_secs(3));
-}
-
-fn settings() -> StepSettings {
-    StepSettings {
-        lr_mean: 1.6e-6,
-        lr_scale: 5e-5,
-        lr_quat: 1e-5,
-        lr_opacity: 5e-4,
-        lr_sh0: 2.5e-5,
-        lr_sh_rest: 1e-6,
-        lr_pose_rotation: 1e-7,
-        lr_pose_translation: 1e-7,
-        ssim_weight: 0.2,
-        weights: LossWeights {
-            depth_weight: 0.05,
-            ..LossWeights::all(0.01)
-        },
-        sh_degree: 3,
-        train_splats: true,
-        pose: PoseMode::Direct,
-        ..StepSettings::default()
-    }
-}
-
-fn scene(n: usize, size_px: f64) -> (Splats, TrainingView) {
-    let mut rng = Pcg32::seed_from_u64(7);
-    let mut splats = Splats {
-        sh_degree: 3,
-        ..Splats::default()
-    };
-    for _ in 0..n {
-        let z = rng.random_range(0.5..3.0);
-        let x = (rng.random_range(-5.0..f64::from(WIDTH_PX) + 5.0) - 0.5 * f64::from(WIDTH_PX)) * z
-            / FOCAL_PX;
-        let y = (rng.random_range(-5.0..f64::from(HEIGHT_PX) + 5.0) - 0.5 * f64::from(HEIGHT_PX))
-            * z
-            / FOCAL_PX;
-        splats.means.push([x as f32, y as f32, z as f32]);
-        let size = (size_px * z / FOCAL_PX).ln();
-        splats.log_scales.push(std::array::from_fn(|_| {
-            (size + rng.random_range(-1.2..0.7)) as f32
-        }));
-        splats
-            .quats
-            .push(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
-        splats.opacity_logits.push(rng.random_range(-3.0..2.0));
-        splats
-            .sh
-            .extend((0..48).map(|k| rng.random_range(-1.0..1.0) / (1.0 + k as f32 / 3.0)));
-        splats.anchors.push(0);
-    }
-    let n_pixels = (WIDTH_PX * HEIGHT_PX) as usize;
-    let pixels = (0..3 * n_pixels).map(|_| rng.random()).collect();
-    let depth = DepthMap {
-        width_px: WIDTH_PX,
-        height_px: HEIGHT_PX,
-        depth: (0..n_pixels).map(|_| rng.random_range(0.5..3.0)).collect(),
-        confidence: vec![1.0; n_pixels],
-    };
-    let view = TrainingView {
-        image: Arc::new(RgbImage {
-            width_px: WIDTH_PX,
-            height_px: HEIGHT_PX,
-            pixels,
-        }),
-        intrinsics: Intrinsics {
-            width_px: WIDTH_PX,
-            height_px: HEIGHT_PX,
-            fx: FOCAL_PX,
-            fy: FOCAL_PX,
-            cx: 0.5 * f64::from(WIDTH_PX),
-            cy: 0.5 * f64::from(HEIGHT_PX),
-        },
-        cam_from_world: Rigid::new(DQuat::IDENTITY, DVec3::ZERO),
-        depth: Some(Arc::new(depth)),
-        mask: None,
-    };
-    (splats, view)
 }

@@ -43,11 +43,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var begin = range.x;
     var n_looked_at = 0u;
     var turn = 0u;
-    loop {
-        var most = -1.0;
+    var most = -1.0;
 #repeat i PIXELS
-        most = max(most, t_$i);
+    most = max(most, t_$i);
 #end
+    loop {
         if most > 0.0 {
             atomicStore(&is_open[turn], 1u);
         }

@@ -2,20 +2,7 @@
 // After sort_rows. One workgroup per block. For adapters without subgroups of a known size; see
 // sort_scatter_subgroups.
 
-#import flat
-#import sorting
-#import digit_starts
-
-@group(0) @binding(0) var<uniform> sort_pass: SortPass;
-@group(0) @binding(1) var<storage, read> keys: array<u32>;
-@group(0) @binding(2) var<storage, read> values: array<u32>;
-@group(0) @binding(3) var<storage, read> length: array<u32>;
-// By digit, then block: keys with that digit in the blocks before.
-@group(0) @binding(4) var<storage, read> offsets: array<u32>;
-// Keys with each digit.
-@group(0) @binding(5) var<storage, read> totals: array<u32>;
-@group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> sorted_values: array<u32>;
+#import scattering
 
 const SORT_THREADS: u32 = 32u;
 // Neighbouring keys that one thread takes, in order.

@@ -3,20 +3,7 @@
 // SUBGROUP of them at a time. Lanes with the same digit find each other by ballots, one a bit; the first of them counts
 // for all (the "match" of onesweep, Adinets and Merrill 2022).
 
-#import flat
-#import sorting
-#import digit_starts
-
-@group(0) @binding(0) var<uniform> sort_pass: SortPass;
-@group(0) @binding(1) var<storage, read> keys: array<u32>;
-@group(0) @binding(2) var<storage, read> values: array<u32>;
-@group(0) @binding(3) var<storage, read> length: array<u32>;
-// By digit, then block: keys with that digit in the blocks before.
-@group(0) @binding(4) var<storage, read> offsets: array<u32>;
-// Keys with each digit.
-@group(0) @binding(5) var<storage, read> totals: array<u32>;
-@group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> sorted_values: array<u32>;
+#import scattering
 
 const SUBGROUPS: u32 = 8u;
 const THREADS: u32 = SUBGROUPS * SUBGROUP;

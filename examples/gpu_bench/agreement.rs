@@ -5,8 +5,8 @@ use splat_engine::gradients::Gradients;
 use splat_engine::wgpu::engine::WgpuEngine;
 use splat_engine::wgpu::gradients;
 
-use crate::scene::{scene, settings};
-use crate::wanted;
+use crate::scene::settings;
+use crate::{trained_scene, wanted};
 
 /// Prints distances of the images and gradients, each over the norm of the CPU's.
 pub(crate) fn table() -> anyhow::Result<()> {
@@ -15,7 +15,7 @@ pub(crate) fn table() -> anyhow::Result<()> {
     );
     println!("| splats | sums | image | means | scales | quaternions | opacities | SH | pose |");
     println!("|---|---|---|---|---|---|---|---|---|");
-    let scenes = [1_000, 10_000, 100_000].map(|n| (n, scene(n, [270, 480])));
+    let scenes = [1_000, 10_000, 100_000].map(|n| (n, trained_scene(n, [270, 480])));
     let exact = scenes
         .iter()
         .map(|(_, (splats, view))| cpu::gradients(splats, view, &settings()));

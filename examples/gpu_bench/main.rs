@@ -13,8 +13,10 @@ use std::path::PathBuf;
 use clap::{Parser, ValueEnum};
 
 use splat_engine::traits::Device as _;
+use splat_engine::view::TrainingView;
 use splat_engine::wgpu::engine::WgpuEngine;
 use splat_gpu::device::Wanted;
+use splat_types::splats::splats::Splats;
 
 /// Benchmarks of a GPU.
 #[derive(Debug, Parser)]
@@ -93,4 +95,10 @@ pub(crate) fn wanted(lanes: Option<u32>, float_atomics: bool) -> Wanted {
         float_atomics,
         lanes,
     }
+}
+
+/// A scene whose splats are as large together as those of trained maps: some 200 in a tile at 270x480.
+pub(crate) fn trained_scene(n: usize, size: [u32; 2]) -> (Splats, TrainingView) {
+    let n_pixels = f64::from(size[0]) * f64::from(size[1]);
+    scene::scene(n, 1.2 * (n_pixels / n as f64).sqrt(), size)
 }

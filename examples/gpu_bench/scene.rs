@@ -1,4 +1,4 @@
-//! Random splats before a camera, and a photo and depth of noise.
+//! Random splats before a camera, photos and depth of noise: for `gpu_bench` and the benchmarks of `benches/`.
 
 use std::sync::Arc;
 
@@ -9,18 +9,25 @@ use rand_pcg::Pcg32;
 use splat_engine::loss_weights::LossWeights;
 use splat_engine::settings::{PoseMode, StepSettings};
 use splat_engine::view::TrainingView;
+use splat_geometry::mvs::view::MvsView;
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 use splat_types::splats::splats::Splats;
 use splat_types::transform::Rigid;
 
-/// `n` splats over the whole image, as large together as those of trained maps: some 200 in a tile at 270x480.
-pub(crate) fn scene(n: usize, [width_px, height_px]: [u32; 2]) -> (Splats, TrainingView) {
+/// Focal length over the shorter side of the image.
+const FOCAL_SHARE: f64 = 350.0 / 270.0;
+
+/// `n` splats over the whole image, of `size_px` each in the middle.
+pub(crate) fn scene(
+    n: usize,
+    size_px: f64,
+    [width_px, height_px]: [u32; 2],
+) -> (Splats, TrainingView) {
     let mut rng = Pcg32::seed_from_u64(7);
     let (width, height) = (f64::from(width_px), f64::from(height_px));
-    let focal = 1.3 * width.min(height);
-    let size_px = 1.2 * (width * height / n as f64).sqrt();
+    let focal = FOCAL_SHARE * width.min(height);
     let mut splats = Splats {
         sh_degree: 3,
         ..Splats::default()
@@ -87,5 +94,27 @@ pub(crate) fn settings() -> StepSettings {
         train_splats: true,
         pose: PoseMode::Direct,
         ..StepSettings::default()
+    }
+}
+
+/// Of noise: matching takes as long whatever there is to see.
+pub(crate) fn mvs_view([width_px, height_px]: [u32; 2], x: f64) -> MvsView {
+    let mut rng = Pcg32::seed_from_u64(3);
+    let pixels = (0..3 * width_px * height_px).map(|_| rng.random());
+    MvsView {
+        image: Arc::new(RgbImage {
+            width_px,
+            height_px,
+            pixels: pixels.collect(),
+        }),
+        intrinsics: Intrinsics {
+            width_px,
+            height_px,
+            fx: f64::from(width_px),
+            fy: f64::from(width_px),
+            cx: 0.5 * f64::from(width_px),
+            cy: 0.5 * f64::from(height_px),
+        },
+        submap_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
     }
 }

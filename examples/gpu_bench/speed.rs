@@ -1,11 +1,6 @@
 //! Steps a second, and where their time goes.
 
 use std::hint::black_box;
-use std::sync::Arc;
-
-use glam::{DQuat, DVec3};
-use rand::{RngExt, SeedableRng};
-use rand_pcg::Pcg32;
 
 use splat_engine::cpu::engine::CpuEngine;
 use splat_engine::traits::{Device as _, Engine, Trainer as _};
@@ -14,12 +9,10 @@ use splat_geometry::mvs::gpu::GpuMatcher;
 use splat_geometry::mvs::stereo;
 use splat_geometry::mvs::view::MvsView;
 use splat_mapper::params::settings::Settings;
-use splat_types::camera::Intrinsics;
-use splat_types::image::RgbImage;
 use splat_types::time::Stopwatch;
-use splat_types::transform::Rigid;
 
-use crate::scene::{scene, settings};
+use crate::scene::{mvs_view, settings};
+use crate::trained_scene;
 use crate::wanted;
 
 const SIZES_PX: [[u32; 2]; 3] = [[270, 480], [518, 388], [1920, 1080]];
@@ -159,7 +152,7 @@ pub(crate) fn sweeps(gpu_only: bool) -> anyhow::Result<()> {
 /// Replaces the engine's map and makes steps that are not timed. One engine for all sizes: NVIDIA's driver (580.159) shows
 /// no adapter to a process that has opened some thirty instances.
 fn set_up(engine: &mut dyn Engine, n_splats: usize, size: [u32; 2]) -> anyhow::Result<usize> {
-    let (splats, view) = scene(n_splats, size);
+    let (splats, view) = trained_scene(n_splats, size);
     engine.retain(&vec![false; engine.len()])?;
     engine.append(&splats)?;
     let view_ix = engine.add_view(view)?;
@@ -192,26 +185,4 @@ fn millis(mut run: impl FnMut()) -> f64 {
         n += 1;
     }
     1e3 * watch.secs() / f64::from(n)
-}
-
-/// Of noise: matching takes as long whatever there is to see.
-fn mvs_view([width_px, height_px]: [u32; 2], x: f64) -> MvsView {
-    let mut rng = Pcg32::seed_from_u64(3);
-    let pixels = (0..3 * width_px * height_px).map(|_| rng.random());
-    MvsView {
-        image: Arc::new(RgbImage {
-            width_px,
-            height_px,
-            pixels: pixels.collect(),
-        }),
-        intrinsics: Intrinsics {
-            width_px,
-            height_px,
-            fx: f64::from(width_px),
-            fy: f64::from(width_px),
-            cx: 0.5 * f64::from(width_px),
-            cy: 0.5 * f64::from(height_px),
-        },
-        submap_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::new(x, 0.0, 0.0)),
-    }
 }

@@ -2,6 +2,8 @@
 // subgroups of SUBGROUP lanes in order. Each leaves its own sums in workgroup memory; once ROUND instances lie there they
 // are added up, in the order of the subgroups, so that one wait serves all of them.
 
+#import subgroup_sums
+
 const ROUND: u32 = 8u;
 const SUBGROUPS: u32 = LANES / SUBGROUP;
 
@@ -9,21 +11,13 @@ var<workgroup> subgroup_sums: array<vec4<f32>, 3u * ROUND * SUBGROUPS>;
 
 // For the instance at `place` of those from `begin` on.
 fn store_sums(begin: u32, place: u32, lane: u32, geometry: vec4<f32>, conic: vec4<f32>, color: vec4<f32>) {
-    var geometry_sum = vec4<f32>(0.0);
-    var conic_sum = vec4<f32>(0.0);
-    var color_sum = vec4<f32>(0.0);
-    // Many splats of a tile miss all pixels of a subgroup.
-    if subgroupAny(any(geometry != vec4<f32>(0.0)) || any(conic != vec4<f32>(0.0)) || any(color != vec4<f32>(0.0))) {
-        geometry_sum = subgroupAdd(geometry);
-        conic_sum = vec4<f32>(subgroupAdd(conic.xyz), 0.0);
-        color_sum = vec4<f32>(subgroupAdd(color.xyz), 0.0);
-    }
+    let sums = subgroup_sums_of(geometry, conic, color);
     let slot = (place - begin) % ROUND;
     if lane % SUBGROUP == 0u {
         let at = 3u * (slot * SUBGROUPS + lane / SUBGROUP);
-        subgroup_sums[at] = geometry_sum;
-        subgroup_sums[at + 1u] = conic_sum;
-        subgroup_sums[at + 2u] = color_sum;
+        subgroup_sums[at] = sums.geometry;
+        subgroup_sums[at + 1u] = sums.conic;
+        subgroup_sums[at + 2u] = sums.color;
     }
     if slot == ROUND - 1u {
         keep_round(place - slot, ROUND, lane);

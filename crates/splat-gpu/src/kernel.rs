@@ -85,7 +85,7 @@ macro_rules! kernels {
 
 crate::kernels! {
     folder "../shaders/";
-    libraries ["digit_starts", "flat", "scanning", "sorting"];
+    libraries ["flat", "scanning", "scattering", "sorting"];
     SCAN_SUMS "scan_sums" 256 [numbers Read, length Read, block_sums ReadWrite];
     SCAN_BLOCKS "scan_blocks" 256 [length Read, block_sums ReadWrite];
     SCAN_APPLY "scan_apply" 256 [numbers Read, length Read, block_sums Read, sums_before ReadWrite];

@@ -1,8 +1,9 @@
 //! Outgoing messages -> a live server that Foxglove connects to ("Open connection", `ws://ADDRESS`): the same CDR bytes as over
 //! zenoh, with their definitions. Nothing comes in.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use foxglove::websocket::{ChannelView, Client, ServerListener};
 use foxglove::{Context, PartialMetadata, RawChannel, Schema, WebSocketServerHandle};
@@ -23,6 +24,12 @@ struct Channel {
 /// By the name that Foxglove shows.
 #[derive(Default)]
 struct Channels(Mutex<BTreeMap<String, Channel>>);
+
+impl Channels {
+    fn locked(&self) -> MutexGuard<'_, BTreeMap<String, Channel>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
 
 /// The server; closed with the node.
 pub(crate) struct FoxgloveTransport {
@@ -79,30 +86,22 @@ impl FoxgloveTransport {
 
     /// The topic's channel, made when it is first needed; keeps the sample for late clients where the topic is latched.
     fn channel(&self, post: &Sample) -> Result<Arc<RawChannel>, PublishError> {
-        let name = match post.topic.name.strip_prefix('/') {
-            Some(_) => post.topic.name.to_owned(),
-            None => format!("/{}/{}", self.namespace, post.topic.name),
-        };
-        let mut channels = self
-            .channels
-            .0
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        if !channels.contains_key(&name) {
-            let raw = self.new_channel(&name, post)?;
-            let depth = match post.topic.delivery {
-                Delivery::Latched { depth } => depth,
-                Delivery::Reliable { .. } | Delivery::Newest => 0,
-            };
-            let channel = Channel {
-                raw,
-                depth,
-                latched: VecDeque::new(),
-            };
-            channels.insert(name.clone(), channel);
-        }
-        let Some(channel) = channels.get_mut(&name) else {
-            unreachable!("it was put there");
+        let name = post.topic.full_name(&self.namespace);
+        let mut channels = self.channels.locked();
+        let channel = match channels.entry(name) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => {
+                let raw = self.new_channel(new.key(), post)?;
+                let depth = match post.topic.delivery {
+                    Delivery::Latched { depth } => depth,
+                    Delivery::Reliable { .. } | Delivery::Newest => 0,
+                };
+                new.insert(Channel {
+                    raw,
+                    depth,
+                    latched: VecDeque::new(),
+                })
+            }
         };
         if channel.depth > 0 {
             channel.latched.push_back(post.clone());
@@ -144,11 +143,7 @@ struct Late {
 
 impl ServerListener for Late {
     fn on_subscribe(&self, client: Client, channel: ChannelView<'_>) {
-        let channels = self
-            .channels
-            .0
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let channels = self.channels.locked();
         let Some(known) = channels.get(channel.topic()) else {
             return;
         };

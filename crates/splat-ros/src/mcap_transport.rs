@@ -66,10 +66,7 @@ impl Open {
         let topic = match self.topics.entry(of.name) {
             Entry::Occupied(known) => known.into_mut(),
             Entry::Vacant(new) => {
-                let name = match of.name.strip_prefix('/') {
-                    Some(_) => of.name.to_owned(),
-                    None => format!("/splat_mapper/{}", of.name),
-                };
+                let name = of.full_name("splat_mapper");
                 new.insert(self.file.topic_of(&name, of.type_name, of.definition)?)
             }
         };

@@ -47,6 +47,15 @@ impl Topic {
             delivery,
         }
     }
+
+    /// As ROS 2 and Foxglove show it: below the node's own name, unless it stands alone.
+    pub(crate) fn full_name(&self, namespace: &str) -> String {
+        if self.name.starts_with('/') {
+            self.name.to_owned()
+        } else {
+            format!("/{namespace}/{}", self.name)
+        }
+    }
 }
 
 /// A message ready to go, as often as it is asked for.

@@ -30,6 +30,7 @@ splat_gpu::kernels! {
         "ssim_maps_blur",
         "ssim_maps_load",
         "step",
+        "subgroup_sums",
         "tile_backward",
         "view",
     ] and ["loss_weights" = crate::loss_weights::WGSL_FIELDS];

@@ -57,3 +57,10 @@ impl Default for SelectParams {
         }
     }
 }
+
+impl SelectParams {
+    /// Motion as a share of that which makes a keyframe.
+    pub(crate) fn share_of_wanted(&self, flow: f64, parallax: f64) -> f64 {
+        (flow / self.min_flow).max(parallax / self.min_parallax)
+    }
+}

@@ -103,10 +103,12 @@ impl Selector {
         frame.is_held_out |= every > 0 && frame.seq % every == every / 2;
         // Held-out frames come besides: those that the map learns from stay nearly the same without them.
         let is_kept = self.params.every_frame
-            || (self.takes_photos && self.is_new_photo(&frame))
-            || (!self.takes_photos && self.shows_more(&frame))
-            || frame.is_held_out;
-        is_kept.then(|| self.keep(frame))
+            || if self.takes_photos {
+                self.is_new_photo(&frame)
+            } else {
+                self.shows_more(&frame)
+            };
+        (is_kept || frame.is_held_out).then(|| self.keep(frame))
     }
 
     /// Whether a photo is not the last one again, as of a camera at rest; it then takes that one's place.
@@ -114,9 +116,7 @@ impl Selector {
         let grey = small_grey(&frame.image);
         let is_new = match self.last.as_mut().map(|last| last.follow(grey.clone())) {
             Some(Motion::Measured { flow, parallax }) => {
-                let params = &self.params;
-                let share = (flow / params.min_flow).max(parallax / params.min_parallax);
-                share >= REPEATED_SHARE
+                self.params.share_of_wanted(flow, parallax) >= REPEATED_SHARE
             }
             None | Some(Motion::Lost | Motion::Unknown) => true,
         };
@@ -147,8 +147,8 @@ impl Selector {
                 Motion::Lost => is_sharp,
                 Motion::Measured { flow, parallax } => {
                     let params = &self.params;
-                    let share = (flow / params.min_flow).max(parallax / params.min_parallax);
-                    share >= 1.0 && (is_sharp || flow >= params.min_flow + params.max_blur_wait)
+                    params.share_of_wanted(flow, parallax) >= 1.0
+                        && (is_sharp || flow >= params.min_flow + params.max_blur_wait)
                 }
             };
             if too_soon || !moved || frame.is_held_out {

@@ -1,4 +1,18 @@
-// Where the keys with each digit begin, from the number of keys with each; the shader binds them as `totals`.
+// What both kinds of `sort_scatter` bind, and where the keys with each digit begin.
+
+#import flat
+#import sorting
+
+@group(0) @binding(0) var<uniform> sort_pass: SortPass;
+@group(0) @binding(1) var<storage, read> keys: array<u32>;
+@group(0) @binding(2) var<storage, read> values: array<u32>;
+@group(0) @binding(3) var<storage, read> length: array<u32>;
+// By digit, then block: keys with that digit in the blocks before.
+@group(0) @binding(4) var<storage, read> offsets: array<u32>;
+// Keys with each digit.
+@group(0) @binding(5) var<storage, read> totals: array<u32>;
+@group(0) @binding(6) var<storage, read_write> sorted_keys: array<u32>;
+@group(0) @binding(7) var<storage, read_write> sorted_values: array<u32>;
 
 const CHUNK: u32 = 8u;
 const CHUNKS: u32 = DIGITS / CHUNK;
