@@ -63,10 +63,14 @@ fn show(path: &str, params: &Params, stop: &Stop) -> anyhow::Result<()> {
     let viewer = started(params, Shown::Map, path)?;
     map.show(viewer.hub());
     say(format!("{n} splats at {} until Ctrl-C", viewer.url()));
+    wait_until_asked(stop);
+    Ok(())
+}
+
+fn wait_until_asked(stop: &Stop) {
     while !stop.is_asked() {
         std::thread::sleep(TICK);
     }
-    Ok(())
 }
 
 /// What a mapper has published, of a file that `publish.record` wrote.
@@ -92,9 +96,7 @@ fn play(path: &str, params: &Params, stop: &Stop) -> anyhow::Result<()> {
         bail!("{n} messages and no map in it: a file that publish.record wrote has one: {path}");
     }
     say(format!("{n} messages at {} until Ctrl-C", viewer.url()));
-    while !stop.is_asked() {
-        std::thread::sleep(TICK);
-    }
+    wait_until_asked(stop);
     Ok(())
 }
 

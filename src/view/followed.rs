@@ -104,16 +104,10 @@ impl FollowedMap {
         };
         let mut snapshot = held.clone();
         if snapshot.map_id == self.map_id {
-            let newest = self.poses.values().copied();
-            let known: BTreeMap<u32, KeyframePose> = snapshot
-                .poses
-                .iter()
-                .map(|pose| (pose.keyframe_id, *pose))
-                .collect();
-            let all: BTreeMap<u32, KeyframePose> = known
-                .into_iter()
-                .chain(newest.map(|pose| (pose.keyframe_id, pose)))
-                .collect();
+            // Later ones take the place of earlier ones.
+            let poses = snapshot.poses.iter().chain(self.poses.values());
+            let all: BTreeMap<u32, KeyframePose> =
+                poses.map(|pose| (pose.keyframe_id, *pose)).collect();
             snapshot.poses = all.into_values().collect();
         }
         self.map_from_world.scale = snapshot.scale.metres_per_unit.unwrap_or(1.0);

@@ -49,6 +49,16 @@ pub fn publish(viewer: &ViewTransport, snapshot: &Arc<Snapshot>) {
     });
 }
 
+/// A server with a map, and a client that holds it.
+pub fn watched(n: usize, n_keyframes: usize) -> (ViewTransport, Arc<Snapshot>, ViewClient) {
+    let viewer = started();
+    let newest = Arc::new(snapshot(n, n_keyframes, 1));
+    publish(&viewer, &newest);
+    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
+    client.follow_to(1);
+    (viewer, newest, client)
+}
+
 /// Splats hang on the keyframes in turn.
 fn spread(mut snapshot: Snapshot) -> Snapshot {
     let mut splats = (*snapshot.splats).clone();
@@ -71,12 +81,8 @@ pub fn holds(client: &ViewClient, snapshot: &Snapshot) {
 
 #[test]
 fn after_a_thousand_revisions_and_a_break_clients_hold_the_published_map() {
-    let viewer = started();
     let mut dice = Dice(3);
-    let mut newest = Arc::new(snapshot(30_000, 12, 1));
-    publish(&viewer, &newest);
-    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
-    client.follow_to(1);
+    let (viewer, mut newest, mut client) = watched(30_000, 12);
     holds(&client, &newest);
     assert_eq!(client.keyframes.len(), 12);
     assert_eq!(client.welcome["source"], json!("live"));
@@ -125,11 +131,7 @@ fn after_a_thousand_revisions_and_a_break_clients_hold_the_published_map() {
 
 #[test]
 fn corrections_resets_and_another_map_begin_anew() {
-    let viewer = started();
-    let mut newest = Arc::new(snapshot(2000, 6, 1));
-    publish(&viewer, &newest);
-    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
-    client.follow_to(1);
+    let (viewer, mut newest, mut client) = watched(2000, 6);
     // A loop: keyframes and splats move.
     let mut moved = (*newest).clone();
     (moved.epoch, moved.revision) = (moved.epoch + 1, 2);

@@ -8,7 +8,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use crate::view_client::ViewClient;
-use crate::viewer::{holds, publish, settings, snapshot, started};
+use crate::viewer::{holds, publish, settings, snapshot, started, watched};
 use splat_ros::transport::{Event, Transport};
 use splat_types::image::RgbImage;
 use splat_types::snapshot::Snapshot;
@@ -120,11 +120,7 @@ fn strangers_are_refused() {
 
 #[test]
 fn nonsense_ends_its_own_connection_alone() {
-    let viewer = started();
-    let newest = Arc::new(snapshot(1000, 4, 1));
-    publish(&viewer, &newest);
-    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
-    client.follow_to(1);
+    let (viewer, newest, mut client) = watched(1000, 4);
     for wrong in [
         json!("hello"),
         json!({"type": "hello", "protocol": 2}),
@@ -178,11 +174,7 @@ fn nonsense_ends_its_own_connection_alone() {
 
 #[test]
 fn ten_thousand_connections_leave_those_that_were_there() {
-    let viewer = started();
-    let newest = Arc::new(snapshot(1000, 4, 1));
-    publish(&viewer, &newest);
-    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
-    client.follow_to(1);
+    let (viewer, newest, mut client) = watched(1000, 4);
     let address = viewer
         .url()
         .trim_start_matches("http://")
