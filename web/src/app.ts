@@ -253,6 +253,10 @@ export class App implements Watcher {
   private frame(now: number): void {
     const seconds = Math.min((now - this.last) / 1000, 0.1);
     this.last = now;
+    if (this.world.isHolding()) {
+      this.isCalm &&= !this.isWorking && !this.world.isSorting();
+      return;
+    }
     const isUploaded = this.world.upload(this.model.store);
     if (this.timings.firstSplatsAt === 0 && this.model.store.nSplats() > 0) {
       this.timings.firstSplatsAt = performance.now();

@@ -6,15 +6,28 @@ import { App } from "./app";
 import { element } from "./dom";
 import type { Pose } from "./wire";
 
+/// null where the browser has no WebGL 2; another canvas to find out would cost as long as the one that is drawn on.
+function opened(place: HTMLElement): App | null {
+  try {
+    return new App(place);
+  } catch (error) {
+    if (String(error).includes("WebGL")) {
+      place.replaceChildren();
+      return null;
+    }
+    throw error;
+  }
+}
+
 function begin(): void {
   const place = document.getElementById("splat-mapper-viewer") ?? document.body;
   document.head.append(element("style", {}, style));
-  if (!document.createElement("canvas").getContext("webgl2")) {
+  const app = opened(place);
+  if (app === null) {
     const text = "This browser has no WebGL 2, which the viewer draws with. Try a newer one, or allow graphics acceleration in its settings.";
     place.append(element("p", { role: "alert" }, text));
     return;
   }
-  const app = new App(place);
   const longTasks: number[] = [];
   try {
     new PerformanceObserver((list) => longTasks.push(...list.getEntries().map((entry) => entry.duration))).observe({ type: "longtask" });

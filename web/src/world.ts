@@ -4,6 +4,7 @@ import { PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
 import type { Chunk, MapStore } from "./map_store";
+import { Pacing } from "./pacing";
 import type { MapFacts, Pose } from "./wire";
 
 /// Bytes that go to the GPU in a frame.
@@ -47,14 +48,18 @@ export class World {
   /// The splat frame and its unit.
   readonly splatFrame = new THREE.Group();
   readonly spark: SparkRenderer;
+  private readonly pacing: Pacing;
   private readonly drawn = new Map<number, Drawn>();
   private readonly moved = new Map<number, THREE.Matrix4>();
   private readonly hidden = new Set<number>();
 
   constructor(readonly canvas: HTMLCanvasElement) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+    // Asking for errors waits for the compiler.
+    this.renderer.debug.checkShaderErrors = false;
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.spark = new SparkRenderer({ renderer: this.renderer, enableLod: false, preBlurAmount: 0.3, blurAmount: 0, accumExtSplats: true, maxStdDev: 3.33, minAlpha: 1 / 255 });
+    this.pacing = new Pacing(this.renderer.getContext() as WebGL2RenderingContext);
     this.scene.add(this.spark, this.mapFrame);
     // x ahead, y left, z up -> x ahead, y up, z right.
     this.mapFrame.rotation.x = -Math.PI / 2;
@@ -226,7 +231,14 @@ export class World {
     return sorting || sortDirty;
   }
 
+  /// A slow GPU is still at work: another drawing would only wait, and the page with it.
+  isHolding(): boolean {
+    const { sorting } = this.spark as unknown as { sorting: boolean };
+    return !this.renderer.xr.isPresenting && this.pacing.isHolding(sorting);
+  }
+
   render(): void {
     this.renderer.render(this.scene, this.camera);
+    this.pacing.drew();
   }
 }
