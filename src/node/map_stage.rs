@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::node::autosave::Autosave;
 use crate::node::backpressure::Backpressure;
+use crate::node::grid_thread::GridInput;
 use crate::node::job::{Activity, KeyframeLatency, Progress};
 use crate::node::milestones::Milestones;
 use crate::node::publish_threads::Outgoing;
@@ -73,6 +74,8 @@ pub(crate) struct MapStage {
     reports: Option<Arc<Reports>>,
     pub(crate) autosave: Option<Autosave>,
     pub(crate) recovery: Recovery,
+    /// Keyframes go out with their depth.
+    has_grid: bool,
     since_snapshot: Stopwatch,
     grace: ShutdownTimeout,
     pub(crate) figures: MapFigures,
@@ -194,6 +197,7 @@ impl MapStage {
             grace: ShutdownTimeout::new(stop),
             n_frames,
             fitter: None,
+            has_grid: params.grid.enabled && reports.is_some(),
             reports,
             autosave: None,
             recovery,
@@ -497,13 +501,24 @@ impl MapStage {
     }
 
     /// The status counts the splats of what goes out: fewer than the engine's where some are not finite.
-    fn hand_over(&self, snapshot: Arc<Snapshot>, progress: Progress, publish: &mut Publish<'_>) {
+    fn hand_over(
+        &mut self,
+        snapshot: Arc<Snapshot>,
+        progress: Progress,
+        publish: &mut Publish<'_>,
+    ) {
         self.report(|status| status.n_splats = snapshot.splats.len() as u64);
+        let grid = self.has_grid.then(|| GridInput {
+            keyframes: self.keyframe_views(),
+            snapshot: Arc::clone(&snapshot),
+            is_last: progress.has_ended,
+        });
         let submaps = self.map.submap_reports().into_iter();
         let submaps = submaps.filter_map(|submap| submap.parked);
         let outgoing = Outgoing {
             snapshot,
             submaps: submaps.filter(|parked| !parked.splats.is_empty()).collect(),
+            grid,
         };
         publish(Some(outgoing), progress);
     }

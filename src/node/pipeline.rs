@@ -5,10 +5,12 @@ use std::time::Duration;
 
 use crate::node::backpressure::Backpressure;
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
+use crate::node::grid_thread::{GridStage, run_grid};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, Publish, SelectStage};
 use crate::node::publish_threads::{
-    LiveStage, Outgoing, SnapshotStage, run_live, run_publisher, stages_of, streams_of,
+    LiveStage, Outgoing, OutputStages, SnapshotStage, run_live, run_publisher, stages_of,
+    streams_of,
 };
 use crate::node::source_thread::SourceStage;
 use crate::node::threads::{Answer, Niceness, joined, own_pool, run_select, run_source};
@@ -101,19 +103,17 @@ fn run_with(
     }
     let (handles, streams) = job.output.map(|out| (out.handles, out.streams)).unzip();
     let publisher = handles.as_ref().map(|handles| &handles.publisher);
-    let (live, snapshots) = publisher
+    let output = publisher
         .zip(streams)
-        .map(|(publisher, streams)| stages_of(publisher, streams))
-        .unzip();
+        .map(|(publisher, streams)| stages_of(publisher, streams, &job.params.grid));
     let stages = Stages {
         map,
         select: SelectStage::new(&job.params, first_id, handles.as_ref())
             .of_photos(job.source.n_photos()),
         geometry: GeometryStage::new(model, &job.params),
-        track: track.received(live.is_some()),
+        track: track.received(output.is_some()),
         source: SourceStage::new(job.source, job.stop, handles),
-        live,
-        snapshots,
+        output,
     };
     if job.params.sequential {
         Ok(stages.in_sequence(on_progress))
@@ -128,8 +128,7 @@ struct Stages {
     geometry: GeometryStage,
     map: MapStage,
     track: TrackStage,
-    live: Option<LiveStage>,
-    snapshots: Option<SnapshotStage>,
+    output: Option<OutputStages>,
 }
 
 /// All stages after their end.
@@ -148,10 +147,16 @@ struct End {
 impl Stages {
     /// One thread, stage after stage: for tests and bisecting.
     fn in_sequence(mut self, on_progress: &mut dyn FnMut(Progress)) -> End {
-        let (mut live, mut snapshots) = (self.live, self.snapshots);
+        let (mut live, mut snapshots, mut grid) = apart(self.output);
         let mut publish = |outgoing: Option<Outgoing>, progress: Progress| {
-            if let Some((stage, outgoing)) = snapshots.as_mut().zip(outgoing) {
-                stage.publish(&(outgoing, progress.has_ended), 0);
+            if let Some(mut outgoing) = outgoing {
+                let input = outgoing.grid.take();
+                if let Some(stage) = &mut snapshots {
+                    stage.publish(&(outgoing, progress.has_ended), 0);
+                }
+                if let Some((stage, input)) = grid.as_mut().zip(input) {
+                    stage.take(&input, &|| false);
+                }
             }
             on_progress(progress);
         };
@@ -203,7 +208,7 @@ impl Stages {
             geometry: summary(&self.geometry.tally()),
             map: self.map,
             snapshot,
-            streams: joined_streams(live, snapshots),
+            streams: joined_streams(live, snapshots, grid),
             error: result.err().map(|e| format!("geometry: {e}")),
         }
     }
@@ -234,8 +239,14 @@ impl Stages {
         };
 
         let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
-        let live = self
-            .live
+        let (live, snapshot_stage, grid) = apart(self.output);
+        let (grid_tx, inputs) = queue("grid", 1, WhenFull::DropOldest);
+        let has_grid = grid.is_some();
+        let grid = spawn("grid", move || {
+            let pool = has_grid.then(|| own_pool("grid", Niceness::Depth));
+            run_grid(grid, &inputs, pool.flatten())
+        })?;
+        let live = live
             .map(|stage| spawn("live", move || run_live(stage, &events)))
             .transpose()?;
         let track = spawn("track", move || {
@@ -258,7 +269,10 @@ impl Stages {
             let mut publish = |outgoing: Option<Outgoing>, progress: Progress| {
                 // Nobody has to listen: a gone publisher or progress bar is no reason to stop mapping.
                 let is_last = progress.has_ended;
-                if let Some(outgoing) = outgoing {
+                if let Some(mut outgoing) = outgoing {
+                    if let Some(input) = outgoing.grid.take() {
+                        drop(grid_tx.send(input));
+                    }
                     drop(snapshots_tx.send((outgoing, is_last)));
                 }
                 progress_tx.send(progress).ok();
@@ -266,7 +280,7 @@ impl Stages {
             let updates = (poses.as_deref(), updates_tx.as_ref());
             run_map(self.map, updates, &answers, &mut publish)
         })?;
-        let publish = spawn("publish", move || run_publisher(self.snapshots, &snapshots))?;
+        let publish = spawn("publish", move || run_publisher(snapshot_stage, &snapshots))?;
 
         report_progress(&progress, on_progress);
         let (map, snapshot, ending) = joined("map", map)?;
@@ -281,6 +295,7 @@ impl Stages {
         let (source, n_dropped) = joined("source", source)?;
         let select = joined("select", select)?;
         let publish = joined("publish", publish)?;
+        let grid = joined("grid", grid)?;
         let tracking = joined("track", track)?;
         let live = live.map(|live| joined("live", live)).transpose()?;
         Ok(End {
@@ -291,7 +306,7 @@ impl Stages {
             geometry: summary(&tally),
             map,
             snapshot,
-            streams: joined_streams(live, publish),
+            streams: joined_streams(live, publish, grid),
             error: error.map(|e| format!("geometry: {e}")),
         })
     }
@@ -319,9 +334,25 @@ fn when_full(is_live: bool) -> WhenFull {
     }
 }
 
-fn joined_streams(live: Option<LiveStage>, snapshots: Option<SnapshotStage>) -> Option<Streams> {
-    let stages = live.zip(snapshots);
-    stages.map(|(live, snapshots)| streams_of(live, snapshots))
+fn apart(
+    output: Option<OutputStages>,
+) -> (Option<LiveStage>, Option<SnapshotStage>, Option<GridStage>) {
+    match output {
+        Some(stages) => (Some(stages.live), Some(stages.snapshots), Some(stages.grid)),
+        None => (None, None, None),
+    }
+}
+
+fn joined_streams(
+    live: Option<LiveStage>,
+    snapshots: Option<SnapshotStage>,
+    grid: Option<GridStage>,
+) -> Option<Streams> {
+    Some(streams_of(OutputStages {
+        live: live?,
+        snapshots: snapshots?,
+        grid: grid?,
+    }))
 }
 
 fn summary(tally: &Mutex<GeometryTally>) -> GeometryTally {

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::machine::memory::rss_mib;
+use crate::node::grid_thread::{GridInput, GridStage};
 use splat_io::queue::{Received, Receiver};
 use splat_ros::error::PublishError;
 use splat_ros::map_stream::MapStream;
@@ -15,6 +16,7 @@ use splat_ros::publisher::Publisher;
 use splat_ros::status_stream::StatusStream;
 use splat_types::snapshot::Snapshot;
 use splat_types::time::Stopwatch;
+use splat_volume::params::GridParams;
 
 /// Transforms go out at least so often: consumers like to look back no further (Nav2: 10 Hz, better 20).
 const REPEAT: Duration = Duration::from_millis(30);
@@ -34,6 +36,8 @@ pub(crate) enum LiveEvent {
 pub(crate) struct Outgoing {
     pub(crate) snapshot: Arc<Snapshot>,
     pub(crate) submaps: Vec<Arc<Snapshot>>,
+    /// For the grid, where there is one.
+    pub(crate) grid: Option<GridInput>,
 }
 
 /// What goes out, and whether it is the last.
@@ -111,11 +115,19 @@ impl SnapshotStage {
     }
 }
 
+/// All that publish, each for a thread.
+pub(crate) struct OutputStages {
+    pub(crate) live: LiveStage,
+    pub(crate) snapshots: SnapshotStage,
+    pub(crate) grid: GridStage,
+}
+
 /// Who publishes what; `streams_of` takes it apart again.
 pub(crate) fn stages_of(
     publisher: &Arc<Publisher>,
     streams: Streams,
-) -> (LiveStage, SnapshotStage) {
+    grid: &GridParams,
+) -> OutputStages {
     let live = LiveStage {
         publisher: Arc::clone(publisher),
         poses: streams.poses,
@@ -127,15 +139,20 @@ pub(crate) fn stages_of(
         map: streams.map,
         rate_limited: RateLimitedLog::default(),
     };
-    (live, snapshots)
+    OutputStages {
+        live,
+        snapshots,
+        grid: GridStage::new(grid, publisher, streams.grid),
+    }
 }
 
 /// What goes on with the next map.
-pub(crate) fn streams_of(live: LiveStage, snapshots: SnapshotStage) -> Streams {
+pub(crate) fn streams_of(stages: OutputStages) -> Streams {
     Streams {
-        map: snapshots.map,
-        poses: live.poses,
-        status: live.status,
+        map: stages.snapshots.map,
+        poses: stages.live.poses,
+        status: stages.live.status,
+        grid: stages.grid.into_stream(),
     }
 }
 

@@ -18,6 +18,7 @@ use splat_slam::mapper::metric_scale_params::ScaleParams;
 use splat_slam::mapper::params::{DensifyParams, MapParams, MapperParams, McmcParams, TrainParams};
 use splat_slam::select::params::SelectParams;
 use splat_slam::track::params::TrackParams;
+use splat_volume::params::GridParams;
 
 /// All parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -72,6 +73,8 @@ pub struct Params {
     pub eval: EvalParams,
     /// Publishing.
     pub publish: PublishParams,
+    /// Grid for planners.
+    pub grid: GridParams,
     /// ROS 2.
     pub ros2: Ros2Params,
 }
@@ -102,6 +105,7 @@ impl Default for Params {
             scale: ScaleParams::default(),
             eval: EvalParams::default(),
             publish: PublishParams::default(),
+            grid: GridParams::default(),
             ros2: Ros2Params::default(),
         }
     }

@@ -30,9 +30,16 @@ const CRATES: [(&str, &[&str]); 11] = [
             "splat-geometry",
         ],
     ),
+    ("splat-volume", &["splat-types"]),
     (
         "splat-ros",
-        &["splat-types", "splat-image", "splat-msgs", "splat-io"],
+        &[
+            "splat-types",
+            "splat-image",
+            "splat-msgs",
+            "splat-io",
+            "splat-volume",
+        ],
     ),
     ("splat-view", &["splat-types", "splat-msgs", "splat-ros"]),
 ];

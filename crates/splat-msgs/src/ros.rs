@@ -9,6 +9,8 @@ mod rigid;
 
 pub mod standard;
 
+pub mod navigation;
+
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 

@@ -38,6 +38,8 @@ pub mod submap_stream;
 
 pub mod map_stream;
 
+pub mod grid_stream;
+
 pub mod pose_stream;
 
 pub mod status_stream;

@@ -7,6 +7,7 @@ use std::sync::mpsc::Receiver;
 use crate::error::PublishError;
 #[cfg(feature = "foxglove")]
 use crate::foxglove_transport::FoxgloveTransport;
+use crate::grid_stream::{self, GridStream};
 use crate::latched::{self, LatchedStore};
 use crate::map_stream::{self, MapStream};
 use crate::mcap_transport::McapTransport;
@@ -30,6 +31,7 @@ pub fn topics() -> Vec<&'static Topic> {
         &navigation::TOPICS,
         &latched::TOPICS,
         &map_stream::TOPICS,
+        &grid_stream::TOPICS,
         &status::TOPICS,
     ]
     .concat()
@@ -58,6 +60,7 @@ pub struct Streams {
     pub map: MapStream,
     pub poses: PoseStream,
     pub status: StatusStream,
+    pub grid: GridStream,
 }
 
 impl Output {
@@ -127,6 +130,7 @@ impl Output {
         let reports = Arc::<Reports>::default();
         let streams = Streams {
             map: MapStream::new(params, Arc::clone(&reports), Arc::clone(&cells)),
+            grid: GridStream::new(params, Arc::clone(&reports), Arc::clone(&cells)),
             poses: PoseStream::new(mount, params, Arc::clone(&reports), cells),
             status: StatusStream::new(params, Arc::clone(&reports)),
         };

@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use crate::status::{MapStatus, PublishedStatus, SelectStatus, SourceStatus};
+use crate::status::{GridStatus, MapStatus, PublishedStatus, SelectStatus, SourceStatus};
 use splat_io::latest::Latest;
 use splat_types::correction::MapCorrection;
 use splat_types::snapshot::Snapshot;
@@ -22,6 +22,8 @@ pub struct Reports {
     /// Written by the source.
     pub camera: Latest<InputCamera>,
     pub correction: QueuedCorrection,
+    /// Written by the thread that makes grids.
+    pub grid: Latest<GridStatus>,
 }
 
 /// What the input says of its camera.

@@ -124,6 +124,15 @@ pub struct PublishedStatus {
     pub n_queued: usize,
 }
 
+/// What became of the grid.
+#[derive(Debug, Clone, Default)]
+pub struct GridStatus {
+    /// Why there is none; empty: there is one, or none is wanted.
+    pub refused: String,
+    /// Of the volume and of the depth that it is made of.
+    pub bytes: usize,
+}
+
 /// What all stages say at one moment.
 #[derive(Debug, Clone, Copy)]
 pub struct Status<'a> {
@@ -132,6 +141,7 @@ pub struct Status<'a> {
     pub track: &'a TrackStatus,
     pub map: &'a MapStatus,
     pub published: &'a PublishedStatus,
+    pub grid: &'a GridStatus,
 }
 
 impl Status<'_> {
@@ -174,6 +184,9 @@ impl Status<'_> {
         if self.map.n_submaps > 1 {
             let n = self.map.n_submaps;
             warnings.push(format!("{n} parts of the input do not hang together"));
+        }
+        if !self.grid.refused.is_empty() {
+            warnings.push(format!("no grid: {}", self.grid.refused));
         }
         warnings.extend(short_of_time(&self.map.load_shed));
         warnings
@@ -347,6 +360,7 @@ mod tests {
                 track: &track,
                 map: &MapStatus::default(),
                 published: &PublishedStatus::default(),
+                grid: &GridStatus::default(),
             };
             status.message("map", Some(1.0), silent_secs)
         };

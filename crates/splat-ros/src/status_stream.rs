@@ -52,6 +52,7 @@ impl StatusStream {
             track: &self.track,
             map: &self.reports.map.get(),
             published: &self.reports.published.get(),
+            grid: &self.reports.grid.get(),
         };
         let message = status.message(&self.map_frame, rss_mib, silent_secs);
         let stamp = self.track.stamp;

@@ -1,0 +1,208 @@
+//! Grids of the volume -> what costmaps and planners read: the grid, its updates, distances to obstacles.
+
+use std::sync::Arc;
+
+use glam::DQuat;
+
+use crate::error::PublishError;
+use crate::odometry::FrameCells;
+use crate::params::PublishParams;
+use crate::publisher::Publisher;
+use crate::reports::Reports;
+use crate::transport::{Delivery, Sample, Topic};
+use splat_msgs::ros::navigation::{
+    DistanceMapSlice, MapMetaData, OccupancyGrid, OccupancyGridUpdate,
+};
+use splat_msgs::ros::{Header, Pose, TfMessage, TransformStamped, Vector3};
+use splat_types::time::{Stamp, Stopwatch};
+use splat_types::transform::{Rigid, Similarity};
+use splat_volume::distance::{UNKNOWN_DISTANCE, signed_distances};
+use splat_volume::grid::{Extent, Grid};
+
+pub static GRID: Topic = Topic::of::<OccupancyGrid>("grid", Delivery::Latched { depth: 1 });
+/// Below the name of the grid, as Nav2's static layer looks for it.
+pub static UPDATES: Topic =
+    Topic::of::<OccupancyGridUpdate>("grid_updates", Delivery::Reliable { depth: 10 });
+pub static DISTANCES: Topic =
+    Topic::of::<DistanceMapSlice>("distance_slice", Delivery::Latched { depth: 1 });
+pub static TF_STATIC: Topic = Topic::of::<TfMessage>("/tf_static", Delivery::Latched { depth: 1 });
+pub static TOPICS: [&Topic; 4] = [&GRID, &UPDATES, &DISTANCES, &TF_STATIC];
+
+/// Distances are exact up to it, metres; planners look no farther.
+const MAX_DISTANCE: f64 = 2.0;
+/// A change of more cells goes out as a whole grid.
+const MAX_UPDATE_SHARE: f64 = 0.25;
+/// Late joiners get a grid that is at most so old, seconds, and the updates since.
+const WHOLE_SECS: f64 = 5.0;
+
+/// A grid, and where it lies.
+#[derive(Debug, Clone)]
+pub struct PlacedGrid {
+    pub grid: Grid,
+    pub stamp: Stamp,
+    /// Of the ground's normal; identity: the map frame is level.
+    pub level_from_map: DQuat,
+    /// Of the slice of distances, metres.
+    pub height: f64,
+}
+
+/// Owned by the thread that makes grids.
+#[derive(Debug)]
+pub struct GridStream {
+    params: PublishParams,
+    frames: Arc<FrameCells>,
+    reports: Arc<Reports>,
+    /// As readers have it.
+    published: Option<PlacedGrid>,
+    since_whole: Stopwatch,
+    /// Updates went out since the last whole one.
+    is_ahead: bool,
+}
+
+impl GridStream {
+    pub(crate) fn new(
+        params: &PublishParams,
+        reports: Arc<Reports>,
+        frames: Arc<FrameCells>,
+    ) -> Self {
+        Self {
+            params: params.clone(),
+            frames,
+            reports,
+            published: None,
+            since_whole: Stopwatch::start(),
+            is_ahead: false,
+        }
+    }
+
+    /// Takes the splat frame to the map frame, in metres where they are known.
+    pub fn map_from_world(&self, metres_per_unit: Option<f64>) -> Similarity {
+        let mut tree = self.frames.tree();
+        tree.metres_per_unit = metres_per_unit;
+        tree.map_from_world()
+    }
+
+    /// Of the last grid: the next one is no smaller.
+    pub fn extent(&self) -> Option<Extent> {
+        self.published.as_ref().map(|placed| placed.grid.extent)
+    }
+
+    /// Why there is no grid; empty while there is one, or none is wanted.
+    pub fn report(&self, refused: &str, bytes: usize) {
+        self.reports.grid.update(|status| {
+            refused.clone_into(&mut status.refused);
+            status.bytes = bytes;
+        });
+    }
+
+    /// Sends what has changed; nothing where nothing has.
+    pub fn publish(
+        &mut self,
+        publisher: &Publisher,
+        placed: PlacedGrid,
+    ) -> Result<(), PublishError> {
+        let frame = self.frame_of(&placed);
+        let header = || Header::new(placed.stamp, &frame);
+        let before = self.published.take();
+        let before = before.filter(|before| {
+            before.grid.extent == placed.grid.extent
+                && before.level_from_map == placed.level_from_map
+        });
+        let part = before
+            .as_ref()
+            .map(|before| placed.grid.changed_since(&before.grid));
+        let is_whole = match part {
+            None => true,
+            Some(None) => self.is_ahead && self.since_whole.secs() >= WHOLE_SECS,
+            Some(Some([_, _, width, height])) => {
+                let share = (width * height) as f64 / placed.grid.cells.len() as f64;
+                share > MAX_UPDATE_SHARE || self.since_whole.secs() >= WHOLE_SECS
+            }
+        };
+        let is_turned = before.is_none() && placed.level_from_map != DQuat::IDENTITY;
+        if is_turned {
+            publisher.send(&self.level_transform(&placed, &frame)?)?;
+        }
+        if is_whole {
+            publisher.send(&Sample::of(&GRID, placed.stamp, &whole(&placed, header()))?)?;
+            (self.since_whole, self.is_ahead) = (Stopwatch::start(), false);
+        } else if let Some(Some(part)) = part {
+            let update = update(&placed.grid, part, header());
+            publisher.send(&Sample::of(&UPDATES, placed.stamp, &update)?)?;
+            self.is_ahead = true;
+        }
+        if is_whole || part.flatten().is_some() {
+            let slice = distances(&placed, header());
+            publisher.send(&Sample::of(&DISTANCES, placed.stamp, &slice)?)?;
+        }
+        self.published = Some(placed);
+        Ok(())
+    }
+
+    /// The map frame, or one that is level above the same origin.
+    fn frame_of(&self, placed: &PlacedGrid) -> String {
+        if placed.level_from_map == DQuat::IDENTITY {
+            self.params.map_frame.clone()
+        } else {
+            format!("{}_level", self.params.map_frame)
+        }
+    }
+
+    fn level_transform(&self, placed: &PlacedGrid, frame: &str) -> Result<Sample, PublishError> {
+        let pose = Rigid::new(placed.level_from_map.inverse(), glam::DVec3::ZERO);
+        let transform = TransformStamped {
+            header: Header::new(placed.stamp, &self.params.map_frame),
+            child_frame_id: frame.to_owned(),
+            transform: pose.into(),
+        };
+        let transforms = vec![transform];
+        Sample::of(&TF_STATIC, placed.stamp, &TfMessage { transforms })
+    }
+}
+
+/// As Nav2's static layer takes it: the origin on a multiple of the resolution, without a rotation.
+fn whole(placed: &PlacedGrid, header: Header) -> OccupancyGrid {
+    let grid = &placed.grid;
+    let origin = Rigid::new(DQuat::IDENTITY, grid.origin().extend(0.0));
+    OccupancyGrid {
+        info: MapMetaData {
+            map_load_time: header.stamp,
+            resolution: grid.resolution as f32,
+            width: grid.extent.width as u32,
+            height: grid.extent.height as u32,
+            origin: Pose::from(origin),
+        },
+        header,
+        data: grid.cells.clone(),
+    }
+}
+
+fn update(grid: &Grid, part: [usize; 4], header: Header) -> OccupancyGridUpdate {
+    let [x, y, width, height] = part;
+    OccupancyGridUpdate {
+        header,
+        x: x as i32,
+        y: y as i32,
+        width: width as u32,
+        height: height as u32,
+        data: grid.part(part),
+    }
+}
+
+fn distances(placed: &PlacedGrid, header: Header) -> DistanceMapSlice {
+    let grid = &placed.grid;
+    let origin = grid.origin();
+    DistanceMapSlice {
+        header,
+        resolution: grid.resolution as f32,
+        width: grid.extent.width as u32,
+        height: grid.extent.height as u32,
+        origin: Vector3 {
+            x: origin.x,
+            y: origin.y,
+            z: placed.height,
+        },
+        unknown_value: UNKNOWN_DISTANCE,
+        data: signed_distances(grid, MAX_DISTANCE),
+    }
+}

@@ -1,0 +1,166 @@
+//! Keyframes with their depth -> grids for planners. Nobody waits for it: of snapshots that come too fast, the newest counts.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use splat_io::queue::Receiver;
+use splat_ros::grid_stream::{GridStream, PlacedGrid};
+use splat_ros::publisher::Publisher;
+use splat_slam::track::landmarks::KeyframeView;
+use splat_types::snapshot::Snapshot;
+use splat_types::time::Stopwatch;
+use splat_types::transform::Similarity;
+use splat_volume::error::VolumeError;
+use splat_volume::grid::grid;
+use splat_volume::params::GridParams;
+use splat_volume::volume::{KeyframeDepth, Volume};
+
+/// Keyframes that are fused between looks at whether there are newer ones.
+const KEYFRAMES_AT_ONCE: usize = 8;
+/// Seconds between warnings.
+const LOG_SECS: f64 = 10.0;
+
+/// All keyframes as a snapshot has them.
+#[derive(Debug, Clone)]
+pub(crate) struct GridInput {
+    pub(crate) snapshot: Arc<Snapshot>,
+    pub(crate) keyframes: Vec<KeyframeView>,
+    pub(crate) is_last: bool,
+}
+
+/// The volume and its way out.
+pub(crate) struct GridStage {
+    params: GridParams,
+    volume: Volume,
+    map_id: Option<[u8; 16]>,
+    publisher: Arc<Publisher>,
+    stream: GridStream,
+    pool: Option<rayon::ThreadPool>,
+    since_grid: Option<Stopwatch>,
+    since_warning: Option<Stopwatch>,
+}
+
+impl GridStage {
+    pub(crate) fn new(params: &GridParams, publisher: &Arc<Publisher>, stream: GridStream) -> Self {
+        Self {
+            params: params.clone(),
+            volume: Volume::new(params),
+            map_id: None,
+            publisher: Arc::clone(publisher),
+            stream,
+            pool: None,
+            since_grid: None,
+            since_warning: None,
+        }
+    }
+
+    /// What goes on with the next map.
+    pub(crate) fn into_stream(self) -> GridStream {
+        self.stream
+    }
+
+    /// Fuses what is new or has moved, as long as nothing newer waits, and sends the grid.
+    pub(crate) fn take(&mut self, input: &GridInput, has_newer: &dyn Fn() -> bool) {
+        let metres = input.snapshot.scale.metres_per_unit;
+        if metres.is_none() && !self.params.allow_unscaled {
+            let reason = "the scale is unknown, so that heights and distances are; give a baseline, depth, odometry or \
+                          scale.camera_height, or set grid.allow_unscaled";
+            return self.stream.report(reason, self.volume.bytes());
+        }
+        if self.map_id != Some(input.snapshot.map_id) {
+            self.volume = Volume::new(&self.params);
+            self.map_id = Some(input.snapshot.map_id);
+        }
+        let keyframes = keyframes_of(input, &self.stream.map_from_world(metres));
+        let faults = self.volume.set_keyframes(&keyframes);
+        self.warn_of(&faults);
+        loop {
+            let volume = &mut self.volume;
+            let (n_left, faults) = match &self.pool {
+                Some(pool) => pool.install(|| volume.fuse(KEYFRAMES_AT_ONCE)),
+                None => volume.fuse(KEYFRAMES_AT_ONCE),
+            };
+            self.warn_of(&faults);
+            if n_left == 0 || (has_newer() && !input.is_last) {
+                break;
+            }
+        }
+        let is_due = self
+            .since_grid
+            .is_none_or(|watch| watch.secs() >= self.params.period);
+        if is_due || input.is_last {
+            self.send(input, &keyframes);
+        }
+    }
+
+    fn send(&mut self, input: &GridInput, keyframes: &[KeyframeDepth]) {
+        let Some(ground) = self.volume.ground() else {
+            let reason = "no ground was seen: a plane below the camera that leans by less than 25 degrees from level";
+            return self.stream.report(reason, self.volume.bytes());
+        };
+        self.since_grid = Some(Stopwatch::start());
+        self.stream.report("", self.volume.bytes());
+        let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
+            self.volume.level_from_map() * keyframe.map_from_cam.translation
+        });
+        let resolution = self.params.resolution;
+        let focus = (newest / resolution).floor().truncate().as_ivec2();
+        let before = self.stream.extent();
+        let voxel = (ground.height / resolution).floor() as i32;
+        let (params, columns) = (&self.params, self.volume.columns());
+        let placed = PlacedGrid {
+            grid: grid(columns, voxel, params, before, focus),
+            stamp: input.snapshot.stamp,
+            height: ground.height + (params.min_height + params.max_height) / 2.0,
+            level_from_map: self.volume.level_from_map(),
+        };
+        if let Err(e) = self.stream.publish(&self.publisher, placed) {
+            self.warn(&format!("a grid did not go out: {e}"));
+        }
+    }
+
+    fn warn_of(&mut self, faults: &[VolumeError]) {
+        if let Some(first) = faults.first() {
+            self.warn(&format!("{first} ({} in all)", faults.len()));
+        }
+    }
+
+    /// At most once per `LOG_SECS`.
+    fn warn(&mut self, text: &str) {
+        if self
+            .since_warning
+            .is_none_or(|watch| watch.secs() > LOG_SECS)
+        {
+            tracing::warn!("{text}");
+            self.since_warning = Some(Stopwatch::start());
+        }
+    }
+}
+
+fn keyframes_of(input: &GridInput, map_from_world: &Similarity) -> Vec<KeyframeDepth> {
+    let keyframe = |view: &KeyframeView| KeyframeDepth {
+        id: view.keyframe.id,
+        map_from_cam: *map_from_world * Similarity::from(view.world_from_cam),
+        intrinsics: view.intrinsics,
+        depth: Arc::clone(&view.depth),
+    };
+    input.keyframes.iter().map(keyframe).collect()
+}
+
+/// Runs until the map has ended.
+pub(crate) fn run_grid(
+    mut stage: Option<GridStage>,
+    inputs: &Receiver<GridInput>,
+    pool: Option<rayon::ThreadPool>,
+) -> Option<GridStage> {
+    if let Some(stage) = &mut stage {
+        stage.pool = pool;
+    }
+    while let Some(input) = inputs.recv() {
+        if let Some(stage) = &mut stage {
+            stage.take(&input, &|| inputs.len() > 0);
+        }
+    }
+    stage
+}
