@@ -100,6 +100,13 @@ impl GridStage {
             return self.stream.report(reason, self.volume.bytes());
         };
         self.since_grid = Some(Stopwatch::start());
+        tracing::debug!(
+            "grid: {} keyframes, {:.1} MiB, ground at {:.2} m with {:.0} % of the points",
+            self.volume.n_keyframes(),
+            self.volume.bytes() as f64 / f64::from(1 << 20),
+            ground.height,
+            100.0 * ground.share
+        );
         self.stream.report("", self.volume.bytes());
         let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
             self.volume.level_from_map() * keyframe.map_from_cam.translation

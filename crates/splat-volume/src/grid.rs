@@ -18,8 +18,11 @@ pub const UNKNOWN: i8 = -1;
 pub const MAX_SIDE: i32 = 4096;
 /// A grid grows by so many cells at once: a change of its size makes Nav2 clear all layers.
 const GROWTH: i32 = 128;
-/// Heights of a tile's cells, from below: this share of them lies below its ground.
+/// Heights of a tile's cells, from below: this share of them lies below its ground, and another one not far above it, or it is no ground.
 const GROUND_SHARE: f64 = 0.2;
+const FLAT_SHARE: f64 = 0.7;
+/// A tile with fewer surfaces says nothing of the ground.
+const MIN_SURFACES: usize = 8;
 /// Ground is begun where a tile lies so near the ground plane, metres.
 const NEAR_PLANE: f64 = 0.1;
 /// Share of the robot's height that was seen free above ground that was seen, and above any other.
@@ -167,12 +170,12 @@ fn ground_heights(
     params: &GridParams,
 ) -> HashMap<IVec2, i32> {
     let voxel = params.resolution;
-    let candidates: HashMap<IVec2, i32> = tiles
-        .iter()
-        .filter_map(|tile| Some((*tile, lowest_surface(columns.tile(*tile)?)?)))
-        .collect();
     let slope = params.max_slope_deg.to_radians().tan();
     let climb = (slope * f64::from(SIDE)).round() as i32 + 1;
+    let candidates: HashMap<IVec2, i32> = tiles
+        .iter()
+        .filter_map(|tile| Some((*tile, lowest_surface(columns.tile(*tile)?, climb)?)))
+        .collect();
     let near = (NEAR_PLANE / voxel).ceil() as i32;
     let mut heights = HashMap::new();
     let mut queue = VecDeque::new();
@@ -217,16 +220,17 @@ fn ground_heights(
     heights
 }
 
-/// `None`: too few cells show a surface.
-fn lowest_surface(columns: &[Column; 64]) -> Option<i32> {
+/// `None`: too few cells show a surface, or their heights differ by more than the ground does: noise and edges are no ramp to a table.
+fn lowest_surface(columns: &[Column; 64], climb: i32) -> Option<i32> {
     let mut lowest: Vec<i32> = columns
         .iter()
         .filter(|column| column.surface != 0)
         .map(|column| column.surface.trailing_zeros() as i32)
         .collect();
     lowest.sort_unstable();
-    let at = (lowest.len() as f64 * GROUND_SHARE) as usize;
-    (lowest.len() >= 4).then(|| lowest[at])
+    let at = |share: f64| lowest.get((lowest.len() as f64 * share) as usize).copied();
+    let (ground, most) = (at(GROUND_SHARE)?, at(FLAT_SHARE)?);
+    (lowest.len() >= MIN_SURFACES && most - ground <= climb).then_some(ground)
 }
 
 /// What is free and what is not, in voxels above the local ground.

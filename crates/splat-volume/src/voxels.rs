@@ -25,9 +25,9 @@ const MAX_BEHIND: f32 = 3.0;
 const MAX_STEP: f32 = 0.92;
 /// Free space counts so much less than a surface.
 const FREE_SHARE: u32 = 2;
-/// Nothing that weighs less is a surface, or free.
-const MIN_SURFACE_WEIGHT: u32 = 8;
-const MIN_FREE_WEIGHT: u32 = 4;
+/// Nothing that weighs less is a surface, or free: one look at 2.5 m with full trust, two at 5 m.
+const MIN_SURFACE_WEIGHT: u32 = 24;
+const MIN_FREE_WEIGHT: u32 = 8;
 /// Blocks near one keyframe; 32 MiB of indices.
 pub const MAX_CANDIDATES: u64 = 2_000_000;
 
