@@ -300,7 +300,8 @@ struct RenderArgs {
 struct ExportArgs {
     /// map.splatmap, or a .ply or .spz of any program
     map: PathBuf,
-    /// OUT.ply, .compressed.ply, .spz, .glb or .splat; or DIR/ for a scene of images and poses
+    /// OUT.ply, .compressed.ply, .spz, .glb or .splat; .yaml for map_server, .mesh.ply or .npy for planners; or DIR/ for a scene of
+    /// images and poses
     out: PathBuf,
     /// Of a scene: colmap or nerfstudio
     #[arg(long)]
@@ -308,6 +309,8 @@ struct ExportArgs {
     /// Of an .spz: 3, which web viewers read, or 4
     #[arg(long, value_name = "3|4", default_value_t = 3)]
     spz_version: u32,
+    #[command(flatten)]
+    params: ParamArgs,
 }
 
 #[derive(Debug, Subcommand)]

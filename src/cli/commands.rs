@@ -17,6 +17,7 @@ use crate::doctor::checks;
 use crate::doctor::model_check::Report;
 use crate::eval::{evaluation, render, trajectory};
 use crate::formats::file::{self, SplatFormat};
+use crate::formats::planner_map::{self, PlannerFile};
 use crate::formats::scene::{self, SceneLayout};
 use crate::formats::spz::SpzVersion;
 use crate::node::engines::Engines;
@@ -164,6 +165,9 @@ pub(crate) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     if is_folder {
         return export_scene(args);
     }
+    if let Some(file) = PlannerFile::of(&args.out) {
+        return export_for_planners(args, file);
+    }
     let splats = read_map(&args.map)?;
     let spz = match args.spz_version {
         3 => SpzVersion::V3,
@@ -175,6 +179,15 @@ pub(crate) fn export(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     };
     save_map(MapFile::As(format, &splats), &args.out)?;
     say(format!("{} splats: {}", splats.len(), args.out.display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn export_for_planners(args: &ExportArgs, file: PlannerFile) -> anyhow::Result<ExitCode> {
+    let params = mapping::settings(&args.params)?.params()?.grid;
+    let map = checkpoint::read(&args.map)?;
+    let mut volume = planner_map::volume(&map, &params)?;
+    let found = file.write(&mut volume, &args.out)?;
+    say(format!("{found}: {}", args.out.display()));
     Ok(ExitCode::SUCCESS)
 }
 

@@ -23,7 +23,7 @@ pub enum SplatFormat {
 }
 
 /// Endings of names that are known, for messages.
-pub const ENDINGS: &str = ".ply, .compressed.ply, .spz, .glb or .splat";
+pub const ENDINGS: &str = ".ply, .compressed.ply, .spz, .glb, .splat, .yaml, .mesh.ply or .npy";
 
 impl SplatFormat {
     /// By the ending of its name. `spz`: the version that an .spz gets.

@@ -15,3 +15,5 @@ pub mod spz;
 pub mod file;
 
 pub mod scene;
+
+pub mod planner_map;

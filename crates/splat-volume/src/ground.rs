@@ -9,11 +9,13 @@ const MAX_TILT_DEG: f64 = 25.0;
 /// A point this near is on the plane, metres.
 const INLIER: f64 = 0.03;
 /// Least share of points on it.
-const MIN_SHARE: f64 = 0.1;
+const MIN_SHARE: f64 = 0.03;
 /// Points that lie farther below, metres, are below it; of more than this share it would be a table.
 const BELOW: f64 = 0.12;
 const MAX_SHARE_BELOW: f64 = 0.04;
-const N_SAMPLES: usize = 400;
+const N_SAMPLES: usize = 1000;
+/// The three points of a sample are at most so far apart in the list: near each other in one image, they are more often on one plane.
+const NEAR: usize = 60;
 /// Fewer say nothing.
 const MIN_POINTS: usize = 300;
 
@@ -29,7 +31,7 @@ pub struct GroundPlane {
 }
 
 impl GroundPlane {
-    /// The lowest large plane that lies nearly across `up` (RANSAC, then a fit to all that lies on it); `None` where there is none.
+    /// Points that come from one image lie side by side. The lowest large plane that lies nearly across `up` (RANSAC, then a fit to all that lies on it); `None` where there is none.
     pub fn find(points: &[DVec3], up: DVec3, seed: u64) -> Option<Self> {
         if points.len() < MIN_POINTS {
             return None;
@@ -37,25 +39,24 @@ impl GroundPlane {
         let mut rng = Pcg32::seed_from_u64(seed);
         let mut best: Option<(usize, DVec3, f64)> = None;
         for _ in 0..N_SAMPLES {
-            let [a, b, c] = [0, 1, 2].map(|_| points[rng.random_range(0..points.len())]);
+            let first = rng.random_range(0..points.len() - NEAR);
+            let [a, b, c] = [0, 1, 2].map(|_| points[first + rng.random_range(0..NEAR)]);
             let normal = (b - a).cross(c - a).normalize_or_zero();
             let normal = normal * normal.dot(up).signum();
             if normal.dot(up) < MAX_TILT_DEG.to_radians().cos() {
                 continue;
             }
             let height = normal.dot(a);
-            let (mut on, mut below) = (0, 0);
-            for p in points {
-                let above = normal.dot(*p) - height;
-                on += usize::from(above.abs() <= INLIER);
-                below += usize::from(above < -BELOW);
-            }
-            let is_lowest = below as f64 <= MAX_SHARE_BELOW * points.len() as f64;
-            if is_lowest && best.is_none_or(|(most, ..)| on > most) {
+            let is_on = |p: &&DVec3| (normal.dot(**p) - height).abs() <= INLIER;
+            let on = points.iter().filter(is_on).count();
+            if best.is_none_or(|(most, ..)| on > most) {
                 best = Some((on, normal, height));
             }
         }
+        // Tables, shelves and the floor are parallel: the largest of them has the normal, the lowest is the floor.
         let (_, normal, height) = best?;
+        let (normal, _) = (0..3).fold((normal, height), |plane, _| refit(points, plane));
+        let height = lowest(points, normal)?;
         let (normal, height) = (0..3).fold((normal, height), |plane, _| refit(points, plane));
         let n_on = points
             .iter()
@@ -77,6 +78,31 @@ impl GroundPlane {
     pub fn tilt_deg(&self, up: DVec3) -> f64 {
         self.normal.dot(up).clamp(-1.0, 1.0).acos().to_degrees()
     }
+}
+
+/// The lowest height along the normal that many points have, and hardly any less.
+fn lowest(points: &[DVec3], normal: DVec3) -> Option<f64> {
+    let mut heights: Vec<f64> = points.iter().map(|p| normal.dot(*p)).collect();
+    heights.sort_unstable_by(f64::total_cmp);
+    let n = heights.len() as f64;
+    let within = |low: f64, high: f64| {
+        heights.partition_point(|h| *h <= high) - heights.partition_point(|h| *h < low)
+    };
+    let on = |height: f64| within(height - INLIER, height + INLIER);
+    let mut first = heights
+        .iter()
+        .copied()
+        .find(|height| on(*height) as f64 >= MIN_SHARE * n)?;
+    // Up to where most points are.
+    let top = first + 2.0 * INLIER;
+    for step in 1..=8 {
+        let height = top - 2.0 * INLIER * (1.0 - f64::from(step) / 8.0);
+        if on(height) > on(first) {
+            first = height;
+        }
+    }
+    let below = heights.partition_point(|h| *h < first - BELOW) as f64;
+    (below <= MAX_SHARE_BELOW * n).then_some(first)
 }
 
 /// Least squares over the points that lie on it, heights along the old normal.

@@ -297,7 +297,13 @@ impl Volume {
             let near = fused.view.points(stride).filter(|p| p.z <= far);
             points.extend(near.map(|p| fused.target.transform_point(p)));
         }
-        let Some(ground) = GroundPlane::find(&points, DVec3::Z, n_views as u64) else {
+        // Where the map frame is not level, cameras that are held upright say more.
+        let cameras = self.keyframes.values();
+        let up: DVec3 = cameras.map(|k| k.target.rotation * DVec3::NEG_Y).sum();
+        let seed = n_views as u64;
+        let ground = GroundPlane::find(&points, DVec3::Z, seed);
+        let ground = ground.or_else(|| GroundPlane::find(&points, up.normalize_or(DVec3::Z), seed));
+        let Some(ground) = ground else {
             return;
         };
         self.n_views_at_level = n_views;
