@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Crates in layer order, each with the crates of ours that it may use.
-const CRATES: [(&str, &[&str]); 11] = [
+const CRATES: [(&str, &[&str]); 12] = [
     ("splat-types", &[]),
     ("splat-gpu", &[]),
     ("splat-image", &["splat-types"]),

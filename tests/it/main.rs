@@ -25,6 +25,7 @@ mod formats;
 mod foxglove;
 mod gpu_runs;
 mod graphs;
+mod grid;
 mod ground_truth;
 mod hard_images;
 mod hard_world;

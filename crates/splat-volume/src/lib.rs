@@ -4,14 +4,24 @@
 //! it was and put in where it is. [`grid::grid`] classifies cells above the local ground, [`distance::signed_distances`] gives each cell its way
 //! to the nearest obstacle, [`mesh::mesh`] the surface, [`map_file`] the files of map_server. No threads, no clock, no files: the caller has those.
 
-pub mod columns;
-pub mod distance;
 pub mod error;
-pub mod grid;
-pub mod ground;
-pub mod map_file;
-pub mod mesh;
+
 pub mod params;
+
 pub mod view;
-pub mod volume;
+
 pub mod voxels;
+
+pub mod ground;
+
+pub mod columns;
+
+pub mod volume;
+
+pub mod grid;
+
+pub mod distance;
+
+pub mod map_file;
+
+pub mod mesh;

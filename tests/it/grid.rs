@@ -1,0 +1,211 @@
+//! Grids of whole runs: what goes out is what Nav2 takes, and what they say of a room is so.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::IVec2;
+
+use crate::localise::run;
+use splat_mapper::formats::planner_map;
+use splat_msgs::ros::navigation::{DistanceMapSlice, OccupancyGrid, OccupancyGridUpdate};
+use splat_msgs::ros::{self, Header};
+use splat_slam::mapper::keyframes::image_codec::Content;
+use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint};
+use splat_synth::settings::{SceneKind, SynthSettings};
+use splat_synth::take::Take;
+use splat_types::image::RgbImage;
+use splat_volume::grid::{FREE, Grid, OCCUPIED, UNKNOWN};
+use splat_volume::params::GridParams;
+
+const SCENE: &str = "synthetic:room?frames=48&width=320&height=240";
+
+fn take() -> Take {
+    let settings = SynthSettings {
+        n_frames: 48,
+        width_px: 320,
+        height_px: 240,
+        ..SynthSettings::of(SceneKind::Room)
+    };
+    Take::new(settings).unwrap()
+}
+
+fn replayed(geometry: &str, out: &Path, sent: &Path, more: &[&str]) {
+    let record = format!("publish.record={}", sent.display());
+    let mut args = vec![
+        "replay",
+        SCENE,
+        "--geometry",
+        geometry,
+        "--backend",
+        "cpu",
+        "--steps",
+        "10",
+    ];
+    args.extend(["--out", out.to_str().unwrap(), "--set", &record]);
+    args.extend(more.iter().flat_map(|set| ["--set", set]));
+    let output = run(&args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+}
+
+/// Each message of a topic.
+fn messages(sent: &Path, topic: &str) -> Vec<Vec<u8>> {
+    let bytes = std::fs::read(sent).unwrap();
+    let all = mcap::MessageStream::new(&bytes).unwrap();
+    all.map(Result::unwrap)
+        .filter(|message| message.channel.topic == format!("/splat_mapper/{topic}"))
+        .map(|message| message.data.to_vec())
+        .collect()
+}
+
+fn check_header(header: &Header) {
+    assert!(!header.frame_id.is_empty());
+    assert!(header.stamp.nanosec < 1_000_000_000);
+}
+
+/// What Nav2 1.4's `validateMsg` refuses, and what its static layer warns of or misreads (docs/NAVIGATION.md).
+fn check_grid(grid: &OccupancyGrid) {
+    check_header(&grid.header);
+    let (info, turn) = (&grid.info, &grid.info.origin.orientation);
+    assert!(info.resolution >= 1e-6);
+    assert!((1..=32767).contains(&info.width) && (1..=32767).contains(&info.height));
+    assert_eq!(grid.data.len(), info.width as usize * info.height as usize);
+    assert_eq!((turn.x, turn.y, turn.z, turn.w), (0.0, 0.0, 0.0, 1.0));
+    for start in [info.origin.position.x, info.origin.position.y] {
+        let cells = start / f64::from(info.resolution);
+        assert!((cells - cells.round()).abs() < 1e-3, "{cells}");
+    }
+    let known = [FREE, OCCUPIED, UNKNOWN];
+    assert!(grid.data.iter().all(|cell| known.contains(cell)));
+}
+
+#[test]
+fn what_goes_out_is_what_nav2_takes() {
+    let folder = tempfile::tempdir().unwrap();
+    let sent = folder.path().join("sent.mcap");
+    let every = ["map.snapshot_secs=0.2", "grid.period=0.05"];
+    replayed("ground_truth", &folder.path().join("out"), &sent, &every);
+    let grids = messages(&sent, "grid");
+    let grids: Vec<OccupancyGrid> = grids.iter().map(|m| ros::decode(m).unwrap()).collect();
+    assert!(!grids.is_empty());
+    grids.iter().for_each(check_grid);
+    for pair in grids.windows(2) {
+        // It grows in big steps, and never shrinks.
+        let [before, after] = pair else {
+            unreachable!()
+        };
+        assert!(after.info.width >= before.info.width && after.info.width % 128 == 0);
+    }
+    let updates = messages(&sent, "grid_updates");
+    for update in &updates {
+        let update: OccupancyGridUpdate = ros::decode(update).unwrap();
+        check_header(&update.header);
+        let last = &grids.last().unwrap().info;
+        assert!(update.x >= 0 && update.y >= 0 && update.width > 0 && update.height > 0);
+        assert!(update.x as u32 + update.width <= last.width);
+        assert!(update.y as u32 + update.height <= last.height);
+        let n = update.width as usize * update.height as usize;
+        assert_eq!(update.data.len(), n);
+    }
+    let slices = messages(&sent, "distance_slice");
+    let slice: DistanceMapSlice = ros::decode(slices.last().unwrap()).unwrap();
+    check_header(&slice.header);
+    let n = slice.width as usize * slice.height as usize;
+    assert_eq!(slice.data.len(), n);
+    let n_known = slice.data.iter().filter(|d| **d != slice.unknown_value);
+    assert!(n_known.count() > 5000);
+    assert!(slice.data.iter().all(|d| d.is_finite()));
+}
+
+#[test]
+fn without_a_scale_there_is_no_grid_and_the_status_says_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let sent = folder.path().join("sent.mcap");
+    let out = folder.path().join("out");
+    replayed("sfm", &out, &sent, &["scale.source=off"]);
+    assert!(messages(&sent, "grid").is_empty() && messages(&sent, "distance_slice").is_empty());
+    let status = messages(&sent, "status").pop().unwrap();
+    let text = String::from_utf8_lossy(&status);
+    assert!(text.contains("no grid: the scale is unknown"), "{text}");
+    // The file of the map says the same.
+    let map = folder.path().join("out/map.splatmap");
+    let yaml = folder.path().join("map.yaml");
+    let output = run(&["export", map.to_str().unwrap(), yaml.to_str().unwrap()]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("scale is unknown"));
+    assert!(!yaml.exists());
+}
+
+/// The same keyframes with depth that is exact.
+fn exact(map: &Checkpoint) -> Checkpoint {
+    let take = take();
+    let mut map = map.clone();
+    let views = map.views.iter_mut();
+    for view in views {
+        let poses = map.snapshot.poses.iter();
+        let pose = poses.clone().find(|p| p.keyframe_id == view.keyframe_id);
+        let pose = pose.unwrap();
+        let frame = (0..48).find(|ix| take.stamp(*ix) == pose.stamp).unwrap();
+        let k = pose.intrinsics;
+        let n = (k.width_px * k.height_px * 3) as usize;
+        view.content = Content::InMemory {
+            image: Arc::new(RgbImage {
+                width_px: k.width_px,
+                height_px: k.height_px,
+                pixels: vec![0; n],
+            }),
+            depth: Arc::new(take.depth(frame, &k)),
+        };
+    }
+    map
+}
+
+/// Whether a cell near this one, or itself, has the value.
+fn is_near(grid: &Grid, cell: IVec2, value: i8) -> bool {
+    (-1..=1).any(|x| (-1..=1).any(|y| grid.cell(cell + IVec2::new(x, y)) == value))
+}
+
+#[test]
+fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, sent) = (folder.path().join("out"), folder.path().join("sent.mcap"));
+    replayed("ground_truth", &out, &sent, &["grid.enabled=false"]);
+    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+    let params = GridParams::default();
+    let grid_of = |map: &Checkpoint| {
+        let mut volume = planner_map::volume(map, &params).unwrap();
+        let ground = volume.ground().unwrap();
+        // The first camera's height above the floor.
+        let height = take().pose(0).translation.z;
+        assert!(
+            (ground.height + height).abs() < 0.02,
+            "{ground:?}, {height}"
+        );
+        planner_map::grid_of(&mut volume).unwrap()
+    };
+    let (stereo, wanted) = (grid_of(&map), grid_of(&exact(&map)));
+    let [mut n_decided, mut n_agree, mut n_free, mut n_wrong] = [0; 4];
+    for y in 0..wanted.extent.height {
+        for x in 0..wanted.extent.width {
+            let cell = wanted.extent.first + IVec2::new(x, y);
+            let (found, truth) = (stereo.cell(cell), wanted.cell(cell));
+            if found != UNKNOWN && truth != UNKNOWN {
+                n_decided += 1;
+                n_agree += i32::from(is_near(&wanted, cell, found));
+            }
+            if found == FREE && truth != UNKNOWN {
+                n_free += 1;
+                n_wrong += i32::from(!is_near(&wanted, cell, FREE));
+            }
+        }
+    }
+    assert!(n_decided > 5000 && n_free > 4000);
+    assert!(
+        f64::from(n_agree) >= 0.99 * f64::from(n_decided),
+        "{n_agree} of {n_decided}"
+    );
+    assert!(
+        f64::from(n_wrong) <= 0.005 * f64::from(n_free),
+        "{n_wrong} of {n_free}"
+    );
+}
