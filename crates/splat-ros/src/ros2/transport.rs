@@ -15,6 +15,8 @@ use crate::ros2::parameter_store::ParameterStore;
 use crate::ros2::services::{spawn_handler, trigger};
 use crate::transport::{Delivery, Sample, Topic, Transport};
 
+/// Not part of every ROS 2: map_msgs comes with Nav2, nvblox_msgs with Isaac ROS.
+const OPTIONAL_PACKAGES: [&str; 2] = ["map_msgs", "nvblox_msgs"];
 /// Poses that may wait for a slow reader.
 const NEWEST_DEPTH: usize = 5;
 
@@ -22,7 +24,8 @@ const NEWEST_DEPTH: usize = 5;
 #[derive(Debug)]
 pub struct Ros2Transport {
     link: Arc<Link>,
-    publishers: Mutex<BTreeMap<&'static str, PublisherUntyped>>,
+    /// `None`: this ROS 2 has no such type.
+    publishers: Mutex<BTreeMap<&'static str, Option<PublisherUntyped>>>,
 }
 
 impl Ros2Transport {
@@ -37,10 +40,29 @@ impl Ros2Transport {
             publishers: Mutex::default(),
         };
         for topic in topics {
-            let publisher = transport.declare(topic)?;
+            let publisher = transport.declared(topic)?;
             transport.lock().insert(topic.name, publisher);
         }
         Ok(transport)
+    }
+
+    /// A type of a package that many do without is left out where it is missing.
+    fn declared(
+        &self,
+        topic: &'static Topic,
+    ) -> Result<Option<PublisherUntyped>, LinkError> {
+        let package = topic.type_name.split('/').next().unwrap_or_default();
+        match self.declare(topic) {
+            Ok(publisher) => Ok(Some(publisher)),
+            Err(e) if OPTIONAL_PACKAGES.contains(&package) => {
+                tracing::info!(
+                    "{} does not go out over ROS 2: this program was built without {package} ({e})",
+                    topic.name
+                );
+                Ok(None)
+            }
+            Err(e) => Err(e),
+        }
     }
 
     fn declare(&self, topic: &'static Topic) -> Result<PublisherUntyped, LinkError> {
@@ -53,7 +75,7 @@ impl Ros2Transport {
             })
     }
 
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<&'static str, PublisherUntyped>> {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<&'static str, Option<PublisherUntyped>>> {
         // Publishers are only added: a panic leaves nothing half made.
         self.publishers
             .lock()
@@ -71,14 +93,17 @@ impl Transport for Ros2Transport {
         let publisher = match known {
             Some(publisher) => publisher,
             None => {
-                let publisher = self.declare(post.topic).map_err(|e| fail(e.to_string()))?;
+                let publisher = self.declared(post.topic).map_err(|e| fail(e.to_string()))?;
                 self.lock().insert(post.topic.name, publisher.clone());
                 publisher
             }
         };
-        publisher
-            .publish_raw(&post.payload)
-            .map_err(|e| fail(e.to_string()))
+        match publisher {
+            Some(publisher) => publisher
+                .publish_raw(&post.payload)
+                .map_err(|e| fail(e.to_string())),
+            None => Ok(()),
+        }
     }
 
     fn close(&self) -> Result<(), PublishError> {

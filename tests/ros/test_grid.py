@@ -1,0 +1,118 @@
+"""Grids over DDS as Nav2 takes them: each message accepted, late subscribers served, a planner finds its way around walls, files load."""
+
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy
+import rclpy
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import OccupancyGrid
+from nvblox_msgs.msg import DistanceMapSlice
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from tf2_msgs.msg import TFMessage
+
+from mapper import ROOT, Checks, Mapper, Observer, wait_until
+from nav2_rules import FREE, LETHAL, UNKNOWN, StaticLayer, load_map, path_between
+
+check = Checks()
+OUT = pathlib.Path(os.environ.get("ROS_TEST_OUT", "/tmp")) / "grid"
+# As the static layer asks for it.
+MAP = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RELIABLE = QoSProfile(depth=50)
+WORDS = """source.max_side=320 train.max_side=160 train.sh_degree=0 map.max_splats=4000 train.seeds_per_keyframe=300 train.steps=100
+backend=cpu geometry=ground_truth source.pose_topic=/ground_truth/pose source.depth_topic=/camera/depth map.snapshot_secs=0.5
+grid.period=0.2 ros2.enabled=on publish.shutdown_delay=600""".split()
+# A robot of 30 cm.
+RADIUS_CELLS = 3
+
+
+def settings(words):
+    return [part for word in words for part in ("--set", word)]
+
+
+def planned(costs):
+    """Ways between free cells that lie far apart -> (pairs that have one, pairs), cells of walls that a way crosses."""
+    free = numpy.argwhere(costs == FREE)
+    n_found, n_crossed, pairs = 0, 0, []
+    for corner in [(0, 0), (0, 1), (1, 0), (1, 1)]:
+        signs = numpy.where(numpy.array(corner) == 1, 1, -1)
+        order = numpy.argsort(-(free * signs).sum(axis=1))
+        # The first from which a robot of this size goes anywhere.
+        reach = (tuple(int(v) for v in free[i]) for i in order[:: max(1, len(order) // 400)])
+        fits = (cell for cell in reach if path_between(costs, cell, cell, RADIUS_CELLS))
+        pairs.append(next(fits))
+    ways = [(a, b) for i, a in enumerate(pairs) for b in pairs[i + 1 :]]
+    for a, b in ways:
+        path = path_between(costs, a, b, RADIUS_CELLS)
+        n_found += path is not None
+        n_crossed += sum(costs[cell] != FREE for cell in path or [])
+    return n_found, len(ways), n_crossed
+
+
+def main():
+    shutil.rmtree(OUT, ignore_errors=True)
+    OUT.mkdir(parents=True)
+    rclpy.init()
+    observer = Observer()
+    # In one list, so that their order is the wire's.
+    grids = observer.listen(OccupancyGrid, "/splat_mapper/grid", MAP)
+    updates = observer.listen(OccupancyGridUpdate, "/splat_mapper/grid_updates", RELIABLE)
+    slices = observer.listen(DistanceMapSlice, "/splat_mapper/distance_slice", MAP)
+    run = OUT / "run"
+    mapper = Mapper("replay", "recordings/demo.mcap", "--out", str(run), *settings(WORDS), log="grid.log")
+    mapper.wait_for_log("report.html", 240)
+    check("grids come", wait_until(lambda: grids and slices, 20), f"{len(grids)} and {len(updates)} updates")
+    time.sleep(1.0)
+
+    layer = StaticLayer()
+    for _, message in sorted(grids + updates, key=lambda entry: entry[0]):
+        take = layer.take_map if isinstance(message, OccupancyGrid) else layer.take_update
+        take(message)
+    check("Nav2's static layer takes every message", not layer.warnings, "; ".join(layer.warnings))
+    check("the grid seldom changes its size", layer.n_resized <= 4, layer.n_resized)
+    n = {kind: int((layer.costs == kind).sum()) for kind in (FREE, LETHAL, UNKNOWN)}
+    check("nothing is anything else", sum(n.values()) == layer.costs.size, n)
+    check("there is room and there are walls", n[FREE] > 1000 and n[LETHAL] > 300, n)
+
+    newest = slices[-1][1]
+    distances = numpy.array(newest.data).reshape(newest.height, newest.width)
+    same = distances.shape == layer.costs.shape
+    check("the slice has the cells of the grid", same, distances.shape)
+    known = distances != newest.unknown_value
+    check("what the grid does not know, the slice does not", same and (known == (layer.costs != UNKNOWN)).all())
+    check("obstacles are no distance away", same and (distances[layer.costs == LETHAL] < 0).all())
+
+    late = Observer("late")
+    late_grids = late.listen(OccupancyGrid, "/splat_mapper/grid", MAP)
+    transforms = late.listen(TFMessage, "/tf_static", MAP)
+    check("a late subscriber gets the grid", wait_until(lambda: late_grids, 10))
+    frame = layer.frame
+    level = [t for _, m in transforms for t in m.transforms if t.child_frame_id == frame]
+    check("the frame of the grid is the map's, or has a transform", frame == "map" or level, frame)
+
+    n_found, n_ways, n_crossed = planned(layer.costs)
+    check("a planner finds ways", n_found >= 1, f"{n_found} of {n_ways}")
+    check("and none through a wall", n_crossed == 0, n_crossed)
+
+    page = OUT / "map.yaml"
+    program = os.environ["SPLAT_MAPPER"]
+    subprocess.run([program, "export", str(run / "map.splatmap"), str(page)], check=True, cwd=ROOT)
+    values, resolution, _ = load_map(page)
+    n_file = int((values == 0).sum())
+    check("map_server's loader reads the file", resolution == 0.05 and n_file > 1000, n_file)
+
+    code, _ = mapper.end()
+    check("the node ends", code == 0, code)
+    late.close()
+    observer.close()
+    rclpy.shutdown()
+    print(f"{check.n - check.n_failed} of {check.n} checks hold")
+    return check.n_failed != 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
