@@ -15,7 +15,7 @@ use splat_io::whole_file::write_file;
 use splat_ros::odometry::{FrameTree, forward_camera};
 use splat_slam::mapper::map_file::checkpoint::Checkpoint;
 use splat_types::snapshot::KeyframePose;
-use splat_types::transform::Similarity;
+use splat_types::transform::{Rigid, Similarity};
 use splat_volume::grid::{FREE, Grid, OCCUPIED, grid};
 use splat_volume::map_file;
 use splat_volume::mesh::mesh;
@@ -111,12 +111,8 @@ pub fn volume(map: &Checkpoint, params: &GridParams) -> Result<Volume, PlannerEr
     }
     let poses = map.snapshot.poses.iter();
     let poses: BTreeMap<u32, &KeyframePose> = poses.map(|pose| (pose.keyframe_id, pose)).collect();
-    let mut frames = FrameTree::default();
-    frames.metres_per_unit = metres;
-    if let Some((_, first)) = poses.first_key_value() {
-        frames.anchor(first.world_from_cam, forward_camera());
-    }
-    let map_from_world = frames.map_from_world();
+    let first = poses.first_key_value().map(|(_, pose)| pose.world_from_cam);
+    let map_from_world = map_from_world(first.unwrap_or(Rigid::IDENTITY), metres);
     let mut keyframes = Vec::new();
     for view in &map.views {
         let Some(pose) = poses.get(&view.keyframe_id) else {
@@ -135,17 +131,30 @@ pub fn volume(map: &Checkpoint, params: &GridParams) -> Result<Volume, PlannerEr
             depth: Arc::new(depth),
         });
     }
-    let mut volume = Volume::new(params);
-    for fault in volume.set_keyframes(&keyframes) {
-        tracing::warn!("{fault}");
-    }
-    for fault in volume.fuse(usize::MAX).1 {
-        tracing::warn!("{fault}");
-    }
+    let volume = fused(&keyframes, params);
     if volume.voxels().n_blocks() == 0 {
         return Err(PlannerError::NoDepth);
     }
     Ok(volume)
+}
+
+/// The map frame of a run without odometry or a mount: it begins at the first keyframe, which looks along x.
+pub fn map_from_world(first_world_from_cam: Rigid, metres_per_unit: Option<f64>) -> Similarity {
+    let mut frames = FrameTree::default();
+    frames.metres_per_unit = metres_per_unit;
+    frames.anchor(first_world_from_cam, forward_camera());
+    frames.map_from_world()
+}
+
+/// What cannot be fused is left out, with a warning.
+pub fn fused(keyframes: &[KeyframeDepth], params: &GridParams) -> Volume {
+    let mut volume = Volume::new(params);
+    let mut faults = volume.set_keyframes(keyframes);
+    faults.extend(volume.fuse(usize::MAX).1);
+    for fault in faults {
+        tracing::warn!("{fault}");
+    }
+    volume
 }
 
 /// Cells of all that was fused.

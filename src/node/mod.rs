@@ -42,6 +42,8 @@ mod map_stage;
 
 mod open;
 
+mod top_view;
+
 pub mod run_dir;
 
 pub mod localise;

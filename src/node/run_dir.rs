@@ -25,12 +25,14 @@ use crate::machine::memory::peak_rss_mib;
 use crate::node::job::{Activity, Outcome, Progress};
 use crate::node::quality::{MeasuredViews, measure_quality};
 use crate::node::save_map::{MapFile, SaveError, save_map};
+use crate::node::top_view::top_view;
 use crate::node::track_thread::TrackingSummary;
 use crate::params::params::Params;
 use crate::params::settings::{Settings, defaults};
 use crate::report::comparisons::Comparison;
 use crate::report::html::{ReportInputs, write_html};
 use crate::report::pose_quality::write_health;
+use crate::report::top_view::TopView;
 use splat_slam::mapper::mapper::reports::SubmapReport;
 use splat_types::splats::layout::map_sha256;
 use splat_view::embedded;
@@ -112,6 +114,7 @@ pub fn finish(
     let keyframes = timed_keyframes(outcome);
     let rows = frames::rows(&keyframes, tracks, &outcome.input.frame_stamps);
     let written = out.map_or(Ok(()), |out| write_map(outcome, (&keyframes, &rows), out));
+    let from_above = out.and_then(|_| top_view(outcome, &params.grid));
     let (quality, comparisons) = match out {
         Some(_) => quality_at_end(outcome, &params, lpips, on_progress),
         None => (Quality::default(), Vec::new()),
@@ -122,7 +125,8 @@ pub fn finish(
     };
     let reported = out.map_or(Ok(()), |out| {
         let poses = (&keyframes[..], &rows[..]);
-        write_report(outcome, (&report, &comparisons), poses, (out, input))
+        let shown = (&report, &comparisons[..], from_above.as_ref());
+        write_report(outcome, shown, poses, (out, input))
     });
     written.and(reported)?;
     Ok(summary(&report, out))
@@ -190,7 +194,7 @@ fn submap_entries(outcome: &Outcome) -> Vec<SubmapEntry> {
 
 fn write_report(
     outcome: &Outcome,
-    (report, comparisons): (&Report, &[Comparison]),
+    (report, comparisons, top_view): (&Report, &[Comparison], Option<&TopView>),
     (keyframes, rows): (&[TimedPose], &[FrameRow]),
     (out, input): (&Path, &str),
 ) -> anyhow::Result<()> {
@@ -214,6 +218,7 @@ fn write_report(
         trajectory: &frames::trajectory(rows),
         reference: &truth,
         walk: walk.as_deref(),
+        top_view,
     };
     let results: [anyhow::Result<()>; 2] = [
         report.write(&out.join("report.json")).map_err(Into::into),

@@ -17,6 +17,7 @@ use crate::eval::report_json::{Quality, Report};
 use crate::eval::trajectory::{TOLERANCE_SECS, TimedPose, associate};
 use crate::report::charts::{Curve, Paths, View, bars, curve_chart, trajectory_chart};
 use crate::report::comparisons::{Comparison, comparisons};
+use crate::report::top_view::{self, TopView};
 use crate::report::walk;
 use splat_types::transform::Rigid;
 
@@ -42,6 +43,8 @@ pub struct ReportInputs<'a> {
     pub reference: &'a [TimedPose],
     /// Messages of the viewer; `None` where the map is too large, or has no splats.
     pub walk: Option<&'a [u8]>,
+    /// `None` where no ground was seen.
+    pub top_view: Option<&'a TopView>,
 }
 
 pub fn write_html(inputs: &ReportInputs<'_>, path: &Path) -> Result<(), EvalError> {
@@ -73,6 +76,7 @@ fn page(inputs: &ReportInputs<'_>) -> image::ImageResult<Markup> {
                     (notices(report, evaluation.as_ref()))
                     (tiles(report, evaluation.as_ref()))
                     @if let Some(frames) = inputs.walk { (walk::section(frames)?) }
+                    @if let Some(view) = inputs.top_view { (top_view::section(view)?) }
                     (comparisons(inputs.comparisons)?)
                     (curves(inputs))
                     (paths(inputs, evaluation.as_ref()))

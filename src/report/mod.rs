@@ -6,6 +6,8 @@ pub mod comparisons;
 
 pub mod pose_quality;
 
+pub mod top_view;
+
 mod walk;
 
 pub mod html;

@@ -147,6 +147,7 @@ fn write_sample(report: &Report, title: &str, comparisons: &[Comparison], path: 
         trajectory: &walk(200, 0.02),
         reference: &reference,
         walk: None,
+        top_view: None,
     };
     write_html(&inputs, path).unwrap();
     std::fs::read_to_string(path).unwrap()
@@ -287,6 +288,7 @@ fn a_run_that_made_nothing_still_has_a_page() {
             trajectory: keyframes,
             reference: &nowhere,
             walk: None,
+            top_view: None,
         };
         write_html(&inputs, &path).unwrap();
         let page = std::fs::read_to_string(&path).unwrap();

@@ -274,8 +274,12 @@ impl Rules {
         let free = column.free & band;
         let n_unseen = free.trailing_zeros() as i32 - (ground + self.low + 1);
         let begins_low = has_ground || n_unseen <= self.max_unseen;
+        // Between free voxels something may hang or stand that nobody has seen well enough: the top of a table.
+        let highest = HEIGHT - free.leading_zeros() as i32;
+        let between = bits(ground + self.low + 1 + n_unseen.max(0), highest);
+        let is_whole = between & !free == 0;
         let is_seen = f64::from(free.count_ones()) >= share * f64::from(band.count_ones());
-        if begins_low && is_seen && free != 0 {
+        if free != 0 && begins_low && is_whole && is_seen {
             FREE
         } else {
             UNKNOWN

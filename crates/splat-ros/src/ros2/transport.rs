@@ -47,10 +47,7 @@ impl Ros2Transport {
     }
 
     /// A type of a package that many do without is left out where it is missing.
-    fn declared(
-        &self,
-        topic: &'static Topic,
-    ) -> Result<Option<PublisherUntyped>, LinkError> {
+    fn declared(&self, topic: &'static Topic) -> Result<Option<PublisherUntyped>, LinkError> {
         let package = topic.type_name.split('/').next().unwrap_or_default();
         match self.declare(topic) {
             Ok(publisher) => Ok(Some(publisher)),
