@@ -119,6 +119,7 @@ impl GridStage {
         let placed = PlacedGrid {
             grid: grid(columns, voxel, params, before, focus),
             stamp: input.snapshot.stamp,
+            ground: ground.height,
             height: ground.height + (params.min_height + params.max_height) / 2.0,
             level_from_map: self.volume.level_from_map(),
         };

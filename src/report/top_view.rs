@@ -67,7 +67,8 @@ pub(crate) fn section(view: &TopView) -> image::ImageResult<Markup> {
 
 fn drawn(view: &TopView) -> Option<RgbImage> {
     let grid = &view.grid;
-    let (first, last) = known(grid)?;
+    let (first, last) = grid.known()?;
+    let (first, last) = (first - MARGIN, last + MARGIN);
     let size = last - first + 1;
     let px = (SIDE_PX / size.max_element()).clamp(CELL_PX[0], CELL_PX[1]);
     let distances = signed_distances(grid, CLEAR);
@@ -107,21 +108,6 @@ fn drawn(view: &TopView) -> Option<RgbImage> {
         }
     }
     Some(image)
-}
-
-/// The first and the last cell of all that is known, with a margin.
-fn known(grid: &Grid) -> Option<(IVec2, IVec2)> {
-    let width = grid.extent.width;
-    let cells = grid.cells.iter().enumerate();
-    let known = cells.filter(|(_, cell)| **cell != UNKNOWN);
-    let places = known.map(|(at, _)| IVec2::new(at as i32 % width, at as i32 / width));
-    let bounds = places.fold(None, |bounds: Option<(IVec2, IVec2)>, at| {
-        let (low, high) = bounds.unwrap_or((at, at));
-        Some((low.min(at), high.max(at)))
-    });
-    let (low, high) = bounds?;
-    let first = grid.extent.first;
-    Some((low + first - MARGIN, high + first + MARGIN))
 }
 
 fn colour(cell: i8, distance: f64) -> [u8; 3] {

@@ -41,7 +41,10 @@ const CRATES: [(&str, &[&str]); 12] = [
             "splat-volume",
         ],
     ),
-    ("splat-view", &["splat-types", "splat-msgs", "splat-ros"]),
+    (
+        "splat-view",
+        &["splat-types", "splat-msgs", "splat-volume", "splat-ros"],
+    ),
 ];
 
 /// Lines that a file may have; beyond it there are two meanings in one file.

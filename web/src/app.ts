@@ -231,6 +231,7 @@ export class App implements Watcher {
     this.fixed = pose && lens ? { pose, lens } : null;
     this.root.classList.toggle("plain", this.fixed !== null);
     this.overlays.group.visible = this.fixed === null;
+    this.overlays.showGrids(this.fixed !== null);
     this.world.scene.background = this.fixed ? new THREE.Color(0) : this.background;
     if (this.fixed) {
       this.world.renderer.setPixelRatio(1);
@@ -341,6 +342,7 @@ export class App implements Watcher {
       measure,
       button("Save a screenshot", "Screenshot", () => this.screenshot()),
       button("Light or dark", "Theme", () => this.setLight(!this.root.classList.contains("light"))),
+      button("Show the grid of free and occupied ground or not", "Grid", () => this.overlays.toggleGrids()),
       button("Show the state panel or not", "Panel", () => this.panel.side.classList.toggle("hidden")),
       button("Keys", "?", () => this.help.classList.toggle("hidden")),
       extra,
@@ -475,6 +477,7 @@ export class App implements Watcher {
       o: () => {
         this.overlays.group.visible = !this.overlays.group.visible;
       },
+      g: () => this.overlays.toggleGrids(),
       "?": () => this.help.classList.toggle("hidden"),
       Escape: () => this.choose(null),
     };
@@ -489,6 +492,7 @@ function helpBox(): HTMLElement {
     ["drag, wheel, two fingers", "turn, move, zoom"],
     ["click on a keyframe", "fly there and see its photo"],
     ["O", "lines and cameras on or off"],
+    ["G", "free and occupied ground on or off"],
     ["P", "screenshot"],
     ["Esc", "close the photo"],
   ];

@@ -32,11 +32,14 @@ export class Overlays {
   private readonly now = new THREE.Group();
   private readonly ellipsoid: THREE.Mesh;
   private readonly named = new Map<string, THREE.Object3D>();
+  /// In the robot's map frame, on the ground.
+  private readonly grids = new THREE.Group();
+  private hasGrids = true;
   private trailPoints: number[] = [];
   private flashUntil = 0;
   private movedIds = new Set<number>();
 
-  constructor(private readonly world: World) {
+  constructor(world: World) {
     const line = (colour: number): THREE.LineBasicMaterial => new THREE.LineBasicMaterial({ color: colour, transparent: true, depthTest: false });
     this.keyframeLines = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ vertexColors: true, transparent: true, opacity: 0.8, depthTest: false }));
     this.track = new THREE.Line(new THREE.BufferGeometry(), line(COLOURS.keyframe));
@@ -45,6 +48,7 @@ export class Overlays {
       new THREE.SphereGeometry(1, 24, 16),
       new THREE.MeshBasicMaterial({ color: COLOURS.now, transparent: true, opacity: 0.35, depthTest: false }),
     );
+    world.mapFrame.add(this.grids);
     const body = new THREE.LineSegments(new THREE.BufferGeometry(), line(COLOURS.now));
     this.now.add(body);
     this.now.visible = false;
@@ -153,12 +157,28 @@ export class Overlays {
     );
     plane.quaternion.fromArray(grid.rotation);
     plane.position.fromArray(grid.translation);
-    this.replace(grid.name, plane, this.world.mapFrame);
+    this.replace(grid.name, plane, this.grids);
+  }
+
+  /// `isPlain`: nothing but the map is to be seen.
+  showGrids(isPlain: boolean): void {
+    this.grids.visible = this.hasGrids && !isPlain;
+  }
+
+  toggleGrids(): void {
+    this.hasGrids = !this.hasGrids;
+    this.showGrids(false);
   }
 
   private replace(name: string, object: THREE.Object3D, parent: THREE.Object3D): void {
     const before = this.named.get(name);
     before?.removeFromParent();
+    if (before instanceof THREE.Mesh || before instanceof THREE.Line) {
+      before.geometry.dispose();
+      const material = before.material as THREE.MeshBasicMaterial;
+      material.map?.dispose();
+      material.dispose();
+    }
     object.renderOrder = 9;
     object.frustumCulled = false;
     parent.add(object);

@@ -9,7 +9,7 @@ use crate::odometry::FrameCells;
 use crate::params::PublishParams;
 use crate::publisher::Publisher;
 use crate::reports::Reports;
-use crate::transport::{Delivery, Sample, Topic};
+use crate::transport::{Delivery, Event, Sample, Topic};
 use splat_msgs::ros::navigation::{
     DistanceMapSlice, MapMetaData, OccupancyGrid, OccupancyGridUpdate,
 };
@@ -42,7 +42,8 @@ pub struct PlacedGrid {
     pub stamp: Stamp,
     /// Of the ground's normal; identity: the map frame is level.
     pub level_from_map: DQuat,
-    /// Of the slice of distances, metres.
+    /// Of the ground, and of the slice of distances above it, metres.
+    pub ground: f64,
     pub height: f64,
 }
 
@@ -132,6 +133,11 @@ impl GridStream {
             self.is_ahead = true;
         }
         if is_whole || part.flatten().is_some() {
+            publisher.observe(&Event::Grid {
+                grid: &placed.grid,
+                map_from_grid: placed.level_from_map.inverse(),
+                ground: placed.ground,
+            });
             let slice = distances(&placed, header());
             publisher.send(&Sample::of(&DISTANCES, placed.stamp, &slice)?)?;
         }

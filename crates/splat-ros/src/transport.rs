@@ -4,6 +4,7 @@
 
 use std::sync::Arc;
 
+use glam::DQuat;
 use serde::Serialize;
 
 use crate::error::PublishError;
@@ -15,6 +16,7 @@ use splat_types::snapshot::Snapshot;
 use splat_types::time::Stamp;
 use splat_types::tracking::TrackedFrame;
 use splat_types::transform::Similarity;
+use splat_volume::grid::Grid;
 
 /// How messages of a topic travel, as REP-2003 asks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,6 +109,13 @@ pub enum Event<'a> {
     },
     /// The map has moved as a whole; the next map shows it.
     Correction(&'a MapCorrection),
+    /// What is free and what is not.
+    Grid {
+        grid: &'a Grid,
+        map_from_grid: DQuat,
+        /// Of the ground in the frame of the grid, metres.
+        ground: f64,
+    },
 }
 
 /// A way out of the node. Called from several threads.

@@ -4,11 +4,13 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
+use glam::DQuat;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{ExtendedColorType, ImageBuffer, Rgb};
 use tokio::sync::{broadcast, watch};
 
+use crate::grid_message;
 use crate::messages;
 use crate::view_map::{Builder, Published, ViewMap};
 use splat_msgs::status_message::MapperStatus;
@@ -16,6 +18,7 @@ use splat_types::correction::MapCorrection;
 use splat_types::image::RgbImage;
 use splat_types::time::Stamp;
 use splat_types::tracking::TrackedFrame;
+use splat_volume::grid::Grid;
 
 /// Events that a client may lag behind; it goes on with newer ones then.
 const MAX_EVENTS: usize = 256;
@@ -49,6 +52,7 @@ struct Pending {
 pub(crate) struct Latest {
     pub(crate) status: Option<Arc<str>>,
     pub(crate) pose: Option<Arc<str>>,
+    pub(crate) grid: Option<Arc<str>>,
     metres_per_unit: Option<f64>,
 }
 
@@ -97,6 +101,14 @@ impl Hub {
         let message: Arc<str> = messages::status(status).into();
         locked(&self.latest).status = Some(Arc::clone(&message));
         self.events.send(message).ok();
+    }
+
+    pub fn grid(&self, grid: &Grid, map_from_grid: DQuat, ground: f64) {
+        if let Some(message) = grid_message::grid(grid, map_from_grid, ground) {
+            let message: Arc<str> = message.into();
+            locked(&self.latest).grid = Some(Arc::clone(&message));
+            self.events.send(message).ok();
+        }
     }
 
     pub fn correction(&self, correction: &MapCorrection) {

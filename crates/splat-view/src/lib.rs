@@ -14,6 +14,8 @@ pub mod settings;
 
 pub mod messages;
 
+mod grid_message;
+
 pub mod hub;
 
 pub mod sync;

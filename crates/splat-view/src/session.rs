@@ -117,7 +117,10 @@ impl Session {
         events: &mut broadcast::Receiver<Arc<str>>,
         map: &mut watch::Receiver<Arc<ViewMap>>,
     ) -> Result<(), Ended> {
-        for event in [latest.status, latest.pose].into_iter().flatten() {
+        for event in [latest.status, latest.pose, latest.grid]
+            .into_iter()
+            .flatten()
+        {
             self.say(&event).await?;
         }
         loop {

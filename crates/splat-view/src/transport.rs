@@ -75,6 +75,11 @@ impl Transport for ViewTransport {
             Event::Frame(frame) => self.hub.frame(frame),
             Event::Keyframe { stamp, image } => self.hub.keyframe(*stamp, image),
             Event::Correction(correction) => self.hub.correction(correction),
+            Event::Grid {
+                grid,
+                map_from_grid,
+                ground,
+            } => self.hub.grid(grid, *map_from_grid, *ground),
         }
     }
 

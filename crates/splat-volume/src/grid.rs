@@ -104,6 +104,20 @@ impl Grid {
         self.extent.index(cell).map_or(UNKNOWN, |at| self.cells[at])
     }
 
+    /// The first and the last cell of the part that holds all known ones; `None` where none is.
+    pub fn known(&self) -> Option<(IVec2, IVec2)> {
+        let width = self.extent.width;
+        let cells = self.cells.iter().enumerate();
+        let known = cells.filter(|(_, cell)| **cell != UNKNOWN);
+        let places = known.map(|(at, _)| IVec2::new(at as i32 % width, at as i32 / width));
+        let bounds = places.fold(None, |bounds: Option<(IVec2, IVec2)>, at| {
+            let (low, high) = bounds.unwrap_or((at, at));
+            Some((low.min(at), high.max(at)))
+        });
+        let first = self.extent.first;
+        bounds.map(|(low, high)| (low + first, high + first))
+    }
+
     /// The smallest part that holds all cells that differ from `before`, which has the same extent: x, y, width and height in cells of the
     /// grid; `None` where none does.
     pub fn changed_since(&self, before: &Self) -> Option<[usize; 4]> {
