@@ -14,6 +14,7 @@ use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint};
 use splat_synth::settings::{SceneKind, SynthSettings};
 use splat_synth::take::Take;
 use splat_types::image::RgbImage;
+use splat_types::snapshot::Scale;
 use splat_volume::grid::{FREE, Grid, OCCUPIED, UNKNOWN};
 use splat_volume::params::GridParams;
 
@@ -137,15 +138,16 @@ fn without_a_scale_there_is_no_grid_and_the_status_says_why() {
 }
 
 /// The same keyframes with depth that is exact.
-fn exact(map: &Checkpoint) -> Checkpoint {
-    let take = take();
+fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
     let mut map = map.clone();
     let views = map.views.iter_mut();
     for view in views {
         let poses = map.snapshot.poses.iter();
         let pose = poses.clone().find(|p| p.keyframe_id == view.keyframe_id);
         let pose = pose.unwrap();
-        let frame = (0..48).find(|ix| take.stamp(*ix) == pose.stamp).unwrap();
+        let frame = (0..take.settings().n_frames)
+            .find(|ix| take.stamp(*ix) == pose.stamp)
+            .unwrap();
         let k = pose.intrinsics;
         let n = (k.width_px * k.height_px * 3) as usize;
         view.content = Content::InMemory {
@@ -183,7 +185,7 @@ fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
         );
         planner_map::grid_of(&mut volume).unwrap()
     };
-    let (stereo, wanted) = (grid_of(&map), grid_of(&exact(&map)));
+    let (stereo, wanted) = (grid_of(&map), grid_of(&exact(&map, &take())));
     let [mut n_decided, mut n_agree, mut n_free, mut n_wrong] = [0; 4];
     for y in 0..wanted.extent.height {
         for x in 0..wanted.extent.width {
@@ -207,5 +209,69 @@ fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
     assert!(
         f64::from(n_wrong) <= 0.005 * f64::from(n_free),
         "{n_wrong} of {n_free}"
+    );
+}
+
+/// Walls of four corridors, mapped by the map's own poses and depth, beside those of the true poses and exact depth.
+#[test]
+fn after_a_loop_there_is_one_wall_and_it_is_where_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let scene = "synthetic:corridor?frames=220&width=320&height=240";
+    let output = run(&[
+        "replay",
+        scene,
+        "--geometry",
+        "sfm",
+        "--backend",
+        "cpu",
+        "--steps",
+        "1",
+        "--out",
+        out.to_str().unwrap(),
+    ]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+    let settings = SynthSettings {
+        n_frames: 220,
+        width_px: 320,
+        height_px: 240,
+        ..SynthSettings::of(SceneKind::Corridor)
+    };
+    let take = Take::new(settings).unwrap();
+    let mut truth = exact(&map, &take);
+    for pose in &mut truth.snapshot.poses {
+        let frame = (0..220).find(|ix| take.stamp(*ix) == pose.stamp).unwrap();
+        pose.world_from_cam = take.pose(frame);
+    }
+    truth.snapshot.scale = Scale::GIVEN;
+    let params = GridParams::default();
+    let grid_of = |map: &Checkpoint| {
+        let mut volume = planner_map::volume(map, &params).unwrap();
+        planner_map::grid_of(&mut volume).unwrap()
+    };
+    let (found, wanted) = (grid_of(&map), grid_of(&truth));
+    // Both begin at the first keyframe; what is left is the scale's error and the poses'. A cell counts as met by one beside it.
+    let count = |a: &Grid, b: &Grid| {
+        let cells = (0..a.cells.len()).map(|at| {
+            let width = a.extent.width as usize;
+            a.extent.first + IVec2::new((at % width) as i32, (at / width) as i32)
+        });
+        let occupied: Vec<IVec2> = cells
+            .filter(|cell| a.cell(*cell) == OCCUPIED && b.cell(*cell) != UNKNOWN)
+            .collect();
+        let met = occupied.iter().filter(|cell| is_near(b, **cell, OCCUPIED));
+        (met.count(), occupied.len())
+    };
+    let (met, n_found) = count(&found, &wanted);
+    let (known, n_wanted) = count(&wanted, &found);
+    assert!(
+        n_found > 1500 && met as f64 >= 0.95 * n_found as f64,
+        "{met} of {n_found}"
+    );
+    assert!(
+        n_wanted > 1500 && known as f64 >= 0.95 * n_wanted as f64,
+        "{known} of {n_wanted}"
     );
 }

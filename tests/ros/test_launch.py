@@ -50,7 +50,7 @@ def stand_in(names):
 def python_launch_files(parameters):
     stand_in(
         """launch.LaunchDescription launch.actions.DeclareLaunchArgument launch.actions.EmitEvent launch.actions.ExecuteProcess
-        launch.actions.IncludeLaunchDescription launch.actions.RegisterEventHandler launch.event_handlers.OnProcessExit
+        launch.actions.IncludeLaunchDescription launch.actions.OpaqueFunction launch.actions.RegisterEventHandler launch.event_handlers.OnProcessExit
         launch.events.Shutdown launch.launch_description_sources.PythonLaunchDescriptionSource
         launch.substitutions.LaunchConfiguration launch.substitutions.PythonExpression launch_ros.actions.Node
         launch_ros.parameter_descriptions.ParameterValue""".split()
@@ -72,6 +72,20 @@ def python_launch_files(parameters):
             check(f"{file.name} sets parameters that exist", named and named <= parameters, named - parameters)
             flags = [word for word in node.named["arguments"] if isinstance(word, str)]
             check(f"{file.name} starts run --source", flags[:2] == ["run", "--source"], flags)
+
+
+def nav2_parameters():
+    """Laid over parameters of a user: those that ours name are ours, all others stay, and the parser of ROS takes the result."""
+    laid_over = runpy.run_path(str(LAUNCH / "nav2.launch.py"))["laid_over"]
+    own = yaml.safe_load((LAUNCH / "nav2.params.yaml").read_text())
+    costmap = {"ros__parameters": {"plugins": ["voxel_layer"], "resolution": 0.1, "footprint": "[]"}}
+    both = laid_over({"global_costmap": {"global_costmap": costmap}, "amcl": {"alpha1": 0.2}}, own)
+    found = both["global_costmap"]["global_costmap"]["ros__parameters"]
+    check("parameters of a user stay", found["footprint"] == "[]" and found["resolution"] == 0.1 and "amcl" in both)
+    check("the layers are ours", found["plugins"][0] == "static_layer" and found["track_unknown_space"], found["plugins"])
+    check("unlike YAML, ROS knows no aliases", "&" not in yaml.safe_dump(both))
+    topics = {found["static_layer"]["map_topic"], found["obstacle_layer"]["keyframes"]["topic"]}
+    check("they read what the node sends", topics == {"/splat_mapper/grid", "/splat_mapper/keyframe_cloud"}, topics)
 
 
 def xml_launch_file(parameters):
@@ -101,7 +115,8 @@ def package(parameters):
         check("the package with the launch files builds", False, error.stderr.decode()[-500:])
         return
     share = install / "share/splat_mapper"
-    wanted = ["launch/mapper.launch.py", "launch/mapper.launch.xml", "launch/replay.launch.py", "params.yaml", "fastdds.xml"]
+    launches = ["mapper.launch.py", "mapper.launch.xml", "nav2.launch.py", "replay.launch.py"]
+    wanted = [*(f"launch/{name}" for name in launches), "params.yaml", "nav2.params.yaml", "fastdds.xml"]
     missing = [name for name in wanted if not (share / name).is_file()]
     check("the package installs its launch files", not missing, missing)
     marker = install / "share/ament_index/resource_index/packages/splat_mapper"
@@ -112,6 +127,7 @@ def package(parameters):
 def main():
     parameters = known_parameters()
     python_launch_files(parameters)
+    nav2_parameters()
     xml_launch_file(parameters)
     package(parameters)
     print(f"{check.n - check.n_failed} of {check.n} checks of the launch files are good")
