@@ -95,6 +95,10 @@ impl GridStage {
     }
 
     fn send(&mut self, input: &GridInput, keyframes: &[KeyframeDepth]) {
+        let snapshot = &input.snapshot;
+        let (voxels, level) = (self.volume.voxels().clone(), self.volume.level_from_map());
+        let at = (snapshot.epoch, snapshot.revision);
+        self.stream.keep_volume(&self.publisher, voxels, level, at);
         let Some(ground) = self.volume.ground() else {
             let reason = "no ground was seen: a plane below the camera that leans by less than 25 degrees from level";
             return self.stream.report(reason, self.volume.bytes());

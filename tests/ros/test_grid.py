@@ -13,6 +13,7 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from nvblox_msgs.msg import DistanceMapSlice
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from splat_mapper_msgs.srv import GetDistances
 from tf2_msgs.msg import TFMessage
 
 from mapper import ROOT, Checks, Mapper, Observer, wait_until
@@ -51,6 +52,38 @@ def planned(costs):
         n_found += path is not None
         n_crossed += sum(costs[cell] != FREE for cell in path or [])
     return n_found, len(ways), n_crossed
+
+
+def ask_distances(observer, layer, slice_):
+    """The service beside grid and slice: at obstacles there is no room, on free ground as much as the slice says, or less above and below it."""
+    def middles(kind):
+        cells = numpy.argwhere(layer.costs == kind)[::7][:3000]
+        xy = (cells[:, ::-1] + 0.5) * layer.info.resolution
+        xy += [layer.info.origin.position.x, layer.info.origin.position.y]
+        heights = numpy.full((len(cells), 1), slice_.origin.z)
+        return cells, numpy.hstack([xy, heights])
+
+    def ask(points, frame=layer.frame):
+        request = GetDistances.Request(frame_id=frame, points=[float(v) for v in points.ravel()])
+        return observer.call(GetDistances, "/splat_mapper/get_distances", request)
+
+    cells, points = middles(FREE)
+    answer = ask(points)
+    good = answer is not None and answer.success and len(answer.distances) == len(points)
+    if not check("get_distances answers", good, answer and answer.message):
+        return
+    plane = numpy.array(slice_.data).reshape(slice_.height, slice_.width)[cells[:, 0], cells[:, 1]]
+    room = numpy.array(answer.distances)
+    known = numpy.array(answer.known)
+    check("the middle of a free cell is free, or nobody knows", (room[known] > 0).all(), room[known].min())
+    # Obstacles of the plane lie at any height: in space none is nearer than half a cell's diagonal less.
+    closer = (room > 0.06 + numpy.hypot(plane, slice_.origin.z + 3)).sum()
+    check("nothing is farther in space than it can be", closer == 0, closer)
+    gradients = numpy.linalg.norm(numpy.array(answer.gradients).reshape(-1, 3), axis=1)
+    units = numpy.isclose(gradients, 1, atol=1e-3) | (gradients == 0)
+    check("gradients are directions", units.all() and (gradients > 0).mean() > 0.5, (gradients > 0).mean())
+    other = ask(points[:1], "odom")
+    check("a frame that it does not know is refused", not other.success and "map" in other.message, other.message)
 
 
 def main():
@@ -97,6 +130,8 @@ def main():
     n_found, n_ways, n_crossed = planned(layer.costs)
     check("a planner finds ways", n_found >= 1, f"{n_found} of {n_ways}")
     check("and none through a wall", n_crossed == 0, n_crossed)
+
+    ask_distances(late, layer, newest)
 
     page = OUT / "map.yaml"
     program = os.environ["SPLAT_MAPPER"]

@@ -29,6 +29,7 @@ pub enum Kind {
     Resume,
     GetSplats,
     RenderView,
+    GetDistances,
 }
 
 macro_rules! trigger {
@@ -71,7 +72,7 @@ const RENDER_VIEW_RESPONSE: &str = concat!(
 );
 
 /// All of them.
-pub static SERVICES: [Service; 8] = [
+pub static SERVICES: [Service; 9] = [
     Service {
         name: "save_map",
         type_name: "splat_mapper_msgs/srv/SaveMap",
@@ -109,5 +110,15 @@ pub static SERVICES: [Service; 8] = [
         request_definition: RENDER_VIEW_REQUEST,
         response_definition: RENDER_VIEW_RESPONSE,
         kind: Kind::RenderView,
+    },
+    Service {
+        name: "get_distances",
+        type_name: "splat_mapper_msgs/srv/GetDistances",
+        request_definition: "string frame_id\nfloat32[] points\nfloat32 max_distance\n",
+        response_definition: concat!(
+            "bool success\nstring message\nstring frame_id\nuint32 epoch\nuint32 revision\nfloat32[] distances\nfloat32[] gradients\n",
+            "bool[] known\n"
+        ),
+        kind: Kind::GetDistances,
     },
 ];

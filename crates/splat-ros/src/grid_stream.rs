@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use glam::DQuat;
 
+use crate::distances::SharedVolume;
 use crate::error::PublishError;
 use crate::odometry::FrameCells;
 use crate::params::PublishParams;
@@ -18,6 +19,7 @@ use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::{Rigid, Similarity};
 use splat_volume::distance::{UNKNOWN_DISTANCE, signed_distances};
 use splat_volume::grid::{Extent, Grid};
+use splat_volume::voxels::Voxels;
 
 pub static GRID: Topic = Topic::of::<OccupancyGrid>("grid", Delivery::Latched { depth: 1 });
 /// Below the name of the grid, as Nav2's static layer looks for it.
@@ -96,13 +98,31 @@ impl GridStream {
         });
     }
 
+    /// Services answer from it until the next one.
+    pub fn keep_volume(
+        &self,
+        publisher: &Publisher,
+        voxels: Voxels,
+        level_from_map: DQuat,
+        (epoch, revision): (u32, u32),
+    ) {
+        publisher.latched().keep_volume(SharedVolume {
+            voxels,
+            level_from_map,
+            map_frame: self.params.map_frame.clone(),
+            level_frame: self.frame_of(level_from_map),
+            epoch,
+            revision,
+        });
+    }
+
     /// Sends what has changed; nothing where nothing has.
     pub fn publish(
         &mut self,
         publisher: &Publisher,
         placed: PlacedGrid,
     ) -> Result<(), PublishError> {
-        let frame = self.frame_of(&placed);
+        let frame = self.frame_of(placed.level_from_map);
         let header = || Header::new(placed.stamp, &frame);
         let before = self.published.take();
         let before = before.filter(|before| {
@@ -146,8 +166,8 @@ impl GridStream {
     }
 
     /// The map frame, or one that is level above the same origin.
-    fn frame_of(&self, placed: &PlacedGrid) -> String {
-        if placed.level_from_map == DQuat::IDENTITY {
+    fn frame_of(&self, level_from_map: DQuat) -> String {
+        if level_from_map == DQuat::IDENTITY {
             self.params.map_frame.clone()
         } else {
             format!("{}_level", self.params.map_frame)

@@ -3,8 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use crate::distances::SharedVolume;
 use crate::error::PublishError;
 use crate::transport::{Delivery, Sample, Topic};
+use splat_io::latest::Latest;
 use splat_msgs::map_messages::{KeyframeArray, Messages, SplatChunk, SplatManifest};
 use splat_types::snapshot::Snapshot;
 use splat_types::splats::layout;
@@ -84,6 +86,8 @@ struct LatchedSample {
 #[derive(Debug)]
 pub struct LatchedStore {
     kept: Mutex<LatchedSample>,
+    /// What planners may ask for distances.
+    volume: Latest<Option<Arc<SharedVolume>>>,
     splat_frame: String,
     chunk_bytes: usize,
 }
@@ -92,9 +96,18 @@ impl LatchedStore {
     pub fn new(splat_frame: &str, chunk_bytes: usize) -> Self {
         Self {
             kept: Mutex::default(),
+            volume: Latest::default(),
             splat_frame: splat_frame.to_owned(),
             chunk_bytes,
         }
+    }
+
+    pub(crate) fn keep_volume(&self, volume: SharedVolume) {
+        self.volume.set(Some(Arc::new(volume)));
+    }
+
+    pub(crate) fn volume(&self) -> Option<Arc<SharedVolume>> {
+        (*self.volume.get()).clone()
     }
 
     fn kept(&self) -> MutexGuard<'_, LatchedSample> {

@@ -4,6 +4,8 @@ pub mod error;
 
 pub mod transport;
 
+pub mod distances;
+
 pub mod latched;
 
 pub mod params;

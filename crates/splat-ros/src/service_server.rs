@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::distances::{self, GetDistancesRequest, GetDistancesResponse};
 use crate::latched::LatchedStore;
 use crate::render_view::{Frames, RenderViewRequest, RenderViewResponse};
 use splat_msgs::map_messages::{MAX_MESSAGE_BYTES, SplatChunk, SplatManifest};
@@ -148,6 +149,7 @@ impl ServiceServer {
             }),
             Kind::GetSplats => self.get_splats(question),
             Kind::RenderView => self.render_view(question),
+            Kind::GetDistances => self.get_distances(question),
         }
     }
 
@@ -281,6 +283,13 @@ impl ServiceServer {
             }
         };
         encoded(&response)
+    }
+
+    fn get_distances(&self, question: &[u8]) -> Vec<u8> {
+        let volume = self.latched.volume();
+        let asked = decoded::<GetDistancesRequest>(question);
+        let response = asked.and_then(|asked| distances::answer(volume.as_deref(), &asked));
+        encoded(&response.unwrap_or_else(GetDistancesResponse::refused))
     }
 
     fn render_view(&self, question: &[u8]) -> Vec<u8> {

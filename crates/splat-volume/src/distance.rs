@@ -55,7 +55,7 @@ fn transposed(rows: &[f32], width: usize, height: usize) -> Vec<f32> {
 }
 
 /// f(q) -> min over q of (p - q)^2 + f(q).
-fn lower_envelope(line: &mut [f32]) {
+pub(crate) fn lower_envelope(line: &mut [f32]) {
     // Parabolas of the envelope: where each stands, its height, and from where on it is the lowest.
     let mut parabolas: Vec<(f64, f64, f64)> = Vec::new();
     for (q, f) in line.iter().enumerate() {

@@ -2,7 +2,7 @@
 //!
 //! [`volume::Volume`] takes keyframes with poses in a level frame (z up, metres) and keeps them, so that a keyframe that moves is taken out where
 //! it was and put in where it is. [`grid::grid`] classifies cells above the local ground, [`distance::signed_distances`] gives each cell its way
-//! to the nearest obstacle, [`mesh::mesh`] the surface, [`map_file`] the files of map_server. No threads, no clock, no files: the caller has those.
+//! to the nearest obstacle, [`field::distances`] points of space theirs, [`mesh::mesh`] the surface, [`map_file`] the files of map_server. No threads, no clock, no files: the caller has those.
 
 pub mod error;
 
@@ -21,6 +21,8 @@ pub mod volume;
 pub mod grid;
 
 pub mod distance;
+
+pub mod field;
 
 pub mod map_file;
 

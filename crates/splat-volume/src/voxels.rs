@@ -5,6 +5,7 @@
 //! taken out again leaves nothing behind, and the order does not matter.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
@@ -54,13 +55,14 @@ pub enum State {
 const SURFACE_SHARE: f32 = 0.6;
 
 /// Block by block; voxel (x, y, z) of the whole has its middle at (x + 0.5, y + 0.5, z + 0.5) times `size`.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Voxels {
     /// Metres.
     pub size: f64,
     /// Metres.
     pub truncation: f64,
-    blocks: HashMap<IVec3, Box<[Voxel; N_VOXELS]>>,
+    /// A copy of the whole shares them until they change.
+    blocks: HashMap<IVec3, Arc<[Voxel; N_VOXELS]>>,
 }
 
 /// Whether a keyframe is put in or taken out.
@@ -208,7 +210,8 @@ impl Voxels {
         let block = self
             .blocks
             .entry(index)
-            .or_insert_with(|| Box::new([Voxel::default(); N_VOXELS]));
+            .or_insert_with(|| Arc::new([Voxel::default(); N_VOXELS]));
+        let block = Arc::make_mut(block);
         match change {
             Change::Add => {
                 for (voxel, own) in block.iter_mut().zip(own) {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use r2r::splat_mapper_msgs::srv::{Export, GetSplats, LoadMap, RenderView, SaveMap};
+use r2r::splat_mapper_msgs::srv::{Export, GetDistances, GetSplats, LoadMap, RenderView, SaveMap};
 use r2r::std_srvs::srv::Trigger;
 use r2r::{QosProfile, ServiceRequest, WrappedServiceTypeSupport, WrappedTypesupport};
 
@@ -49,6 +49,7 @@ pub(crate) fn offer(
             }
             Kind::GetSplats => serve::<GetSplats::Service>(link, name, service_server, jobs),
             Kind::RenderView => serve::<RenderView::Service>(link, name, service_server, jobs),
+            Kind::GetDistances => serve::<GetDistances::Service>(link, name, service_server, jobs),
         }
     })
 }

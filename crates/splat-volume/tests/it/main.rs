@@ -9,6 +9,7 @@ use glam::{DQuat, DVec2, DVec3, IVec2, IVec3};
 use splat_types::depth::DepthMap;
 use splat_types::transform::Similarity;
 use splat_volume::distance::{UNKNOWN_DISTANCE, signed_distances};
+use splat_volume::field::{FieldError, distances};
 use splat_volume::grid::{FREE, Grid, OCCUPIED, UNKNOWN, grid};
 use splat_volume::mesh::mesh;
 use splat_volume::params::GridParams;
@@ -123,6 +124,69 @@ fn the_grid_of_a_room_is_the_room() {
     let n_unknown = grid.cells.iter().filter(|c| **c == UNKNOWN).count();
     let marked = distances.iter().filter(|d| **d == UNKNOWN_DISTANCE).count();
     assert_eq!(n_unknown, marked);
+}
+
+#[test]
+fn distances_in_space_are_those_to_the_world() {
+    let world = World::room();
+    let volume = fused(&keyframes(&world, &round()));
+    let points: Vec<DVec3> = (0..4000)
+        .map(|i| {
+            let share = |p: f64| (f64::from(i) * p).fract();
+            DVec3::new(
+                6.4 * share(0.7548) - 0.2,
+                5.4 * share(0.5698) - 0.2,
+                1.8 * share(0.4302),
+            )
+        })
+        .collect();
+    let found = distances(volume.voxels(), &points, 2.0).unwrap();
+    let [mut errors, mut slopes] = [Vec::new(), Vec::new()];
+    for (point, found) in points
+        .iter()
+        .zip(&found)
+        .filter(|(_, found)| found.is_known)
+    {
+        let wanted = world.distance(*point);
+        // The nearest surface is one that a keyframe has seen.
+        let uphill = DVec3::from_array(
+            DVec3::AXES.map(|axis| (world.distance(*point + axis * 1e-4) - wanted) / 1e-4),
+        );
+        let nearest = *point - uphill * (wanted + 0.01);
+        let voxel = volume.voxels().voxel((nearest / 0.05).floor().as_ivec3());
+        if !matches!(volume.voxels().state(voxel), State::Surface) {
+            continue;
+        }
+        errors.push((found.metres - wanted.clamp(-2.0, 2.0)).abs());
+        // Far from where two surfaces are equally near.
+        let ahead = world.distance(*point + found.gradient * 0.1);
+        if found.metres > 0.2 && found.metres < 1.5 {
+            slopes.push((ahead - wanted) / 0.1);
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    slopes.sort_by(f64::total_cmp);
+    assert!(errors.len() > 1000 && slopes.len() > 500);
+    let at_95 = errors[errors.len() * 95 / 100];
+    assert!(at_95 <= 0.05, "{at_95}");
+    // Ridges, where two surfaces are equally near, have less.
+    let (median, at_10) = (slopes[slopes.len() / 2], slopes[slopes.len() / 10]);
+    assert!(median > 0.95 && at_10 > 0.6, "{median} {at_10}");
+    // What is asked of the outside is answered, or refused in words.
+    let far = distances(volume.voxels(), &[DVec3::splat(50.0)], 2.0).unwrap()[0];
+    assert_eq!(
+        (far.metres, far.gradient, far.is_known),
+        (2.0, DVec3::ZERO, false)
+    );
+    let apart = [DVec3::ZERO, DVec3::splat(1e4)];
+    let refused = distances(volume.voxels(), &apart, 2.0);
+    assert!(matches!(refused, Err(FieldError::TooFarApart { .. })));
+    let nowhere = distances(volume.voxels(), &[DVec3::NAN], 2.0);
+    assert!(matches!(
+        nowhere,
+        Err(FieldError::NotFinite { index: 0, .. })
+    ));
+    assert_eq!(distances(volume.voxels(), &[], 2.0), Ok(vec![]));
 }
 
 #[test]
