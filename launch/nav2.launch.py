@@ -15,13 +15,13 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 
-def laid_over(below, above):
+def merged(below, above):
     """Both trees of parameters; where they meet, `above` counts."""
     if not (isinstance(below, dict) and isinstance(above, dict)):
         return above
     both = dict(below)
     for key, value in above.items():
-        both[key] = laid_over(below[key], value) if key in below else value
+        both[key] = merged(below[key], value) if key in below else value
     return both
 
 
@@ -34,7 +34,7 @@ def nav2(context):
     with open(os.path.join(share, "nav2.params.yaml")) as file:
         above = yaml.safe_load(file)
     with tempfile.NamedTemporaryFile("w", prefix="nav2_params_", suffix=".yaml", delete=False) as file:
-        yaml.safe_dump(laid_over(below, above), file)
+        yaml.safe_dump(merged(below, above), file)
     arguments = {
         "params_file": file.name,
         "use_sim_time": LaunchConfiguration("use_sim_time"),

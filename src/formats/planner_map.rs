@@ -126,7 +126,7 @@ pub fn volume(map: &Checkpoint, params: &GridParams) -> Result<Volume, PlannerEr
         })?;
         keyframes.push(KeyframeDepth {
             id: view.keyframe_id,
-            map_from_cam: map_from_world * Similarity::from(pose.world_from_cam),
+            map_from_camera: map_from_world * Similarity::from(pose.world_from_cam),
             intrinsics: k,
             depth: Arc::new(depth),
         });

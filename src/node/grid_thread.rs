@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use splat_io::queue::Receiver;
-use splat_ros::grid_stream::{GridStream, PlacedGrid};
+use splat_ros::grid_stream::{GridStream, LevelGrid};
 use splat_ros::publisher::Publisher;
 use splat_slam::track::landmarks::KeyframeView;
 use splat_types::snapshot::Snapshot;
@@ -113,21 +113,21 @@ impl GridStage {
         );
         self.stream.report("", self.volume.bytes());
         let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
-            self.volume.level_from_map() * keyframe.map_from_cam.translation
+            self.volume.level_from_map() * keyframe.map_from_camera.translation
         });
         let resolution = self.params.resolution;
         let focus = (newest / resolution).floor().truncate().as_ivec2();
         let before = self.stream.extent();
         let voxel = (ground.height / resolution).floor() as i32;
         let (params, columns) = (&self.params, self.volume.columns());
-        let placed = PlacedGrid {
+        let level_grid = LevelGrid {
             grid: grid(columns, voxel, params, before, focus),
             stamp: input.snapshot.stamp,
             ground: ground.height,
             height: ground.height + (params.min_height + params.max_height) / 2.0,
             level_from_map: self.volume.level_from_map(),
         };
-        if let Err(e) = self.stream.publish(&self.publisher, placed) {
+        if let Err(e) = self.stream.publish(&self.publisher, level_grid) {
             self.warn(&format!("a grid did not go out: {e}"));
         }
     }
@@ -153,7 +153,7 @@ impl GridStage {
 fn keyframes_of(input: &GridInput, map_from_world: &Similarity) -> Vec<KeyframeDepth> {
     let keyframe = |view: &KeyframeView| KeyframeDepth {
         id: view.keyframe.id,
-        map_from_cam: *map_from_world * Similarity::from(view.world_from_cam),
+        map_from_camera: *map_from_world * Similarity::from(view.world_from_cam),
         intrinsics: view.intrinsics,
         depth: Arc::clone(&view.depth),
     };
@@ -171,7 +171,7 @@ pub(crate) fn run_grid(
     }
     while let Some(input) = inputs.recv() {
         if let Some(stage) = &mut stage {
-            stage.take(&input, &|| inputs.len() > 0);
+            stage.take(&input, &|| !inputs.is_empty());
         }
     }
     stage

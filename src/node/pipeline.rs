@@ -1,11 +1,12 @@
 //! Runs the stages: on threads joined by queues, or in sequence. The map is the same either way.
 
 use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crate::node::backpressure::Backpressure;
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
-use crate::node::grid_thread::{GridStage, run_grid};
+use crate::node::grid_thread::{GridInput, GridStage, run_grid};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
 use crate::node::map_stage::{MapStage, Publish, SelectStage};
 use crate::node::publish_threads::{
@@ -240,12 +241,7 @@ impl Stages {
 
         let (events_tx, events) = queue("events", EVENT_QUEUE, when_full);
         let (live, snapshot_stage, grid) = apart(self.output);
-        let (grid_tx, inputs) = queue("grid", 1, WhenFull::DropOldest);
-        let has_grid = grid.is_some();
-        let grid = spawn("grid", move || {
-            let pool = has_grid.then(|| own_pool("grid", Niceness::Depth));
-            run_grid(grid, &inputs, pool.flatten())
-        })?;
+        let (grid_tx, grid) = grid_on_thread(grid)?;
         let live = live
             .map(|stage| spawn("live", move || run_live(stage, &events)))
             .transpose()?;
@@ -332,6 +328,19 @@ fn when_full(is_live: bool) -> WhenFull {
     } else {
         WhenFull::Wait
     }
+}
+
+/// Behind all others: the newest keyframes replace those that wait.
+fn grid_on_thread(
+    grid: Option<GridStage>,
+) -> anyhow::Result<(Sender<GridInput>, JoinHandle<Option<GridStage>>)> {
+    let (sender, inputs) = queue("grid", 1, WhenFull::DropOldest);
+    let has_grid = grid.is_some();
+    let thread = spawn("grid", move || {
+        let pool = has_grid.then(|| own_pool("grid", Niceness::Depth));
+        run_grid(grid, &inputs, pool.flatten())
+    })?;
+    Ok((sender, thread))
 }
 
 fn apart(

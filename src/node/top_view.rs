@@ -40,7 +40,7 @@ pub(crate) fn top_view(outcome: &mut Outcome, params: &GridParams) -> Option<Top
     let map_from_world = planner_map::map_from_world(first, Some(scale));
     let keyframe = |view: &KeyframeView| KeyframeDepth {
         id: view.keyframe.id,
-        map_from_cam: map_from_world * Similarity::from(view.world_from_cam),
+        map_from_camera: map_from_world * Similarity::from(view.world_from_cam),
         intrinsics: view.intrinsics,
         depth: Arc::clone(&view.depth),
     };

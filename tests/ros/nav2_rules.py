@@ -1,6 +1,6 @@
 """What Nav2 does with a map, as its sources of 2026-08 have it: the static layer, the loader of map files, the marks of an obstacle layer.
 
-A twin for tests where Nav2 itself cannot be installed: facts and numbers of navigation2, none of its code.
+A stand-in for tests where Nav2 itself cannot be installed: facts and numbers of navigation2, none of its code.
 """
 
 import heapq

@@ -75,11 +75,11 @@ def python_launch_files(parameters):
 
 
 def nav2_parameters():
-    """Laid over parameters of a user: those that ours name are ours, all others stay, and the parser of ROS takes the result."""
-    laid_over = runpy.run_path(str(LAUNCH / "nav2.launch.py"))["laid_over"]
+    """Merged into parameters of a user: those that ours name are ours, all others stay, and the parser of ROS takes the result."""
+    merged = runpy.run_path(str(LAUNCH / "nav2.launch.py"))["merged"]
     own = yaml.safe_load((LAUNCH / "nav2.params.yaml").read_text())
     costmap = {"ros__parameters": {"plugins": ["voxel_layer"], "resolution": 0.1, "footprint": "[]"}}
-    both = laid_over({"global_costmap": {"global_costmap": costmap}, "amcl": {"alpha1": 0.2}}, own)
+    both = merged({"global_costmap": {"global_costmap": costmap}, "amcl": {"alpha1": 0.2}}, own)
     found = both["global_costmap"]["global_costmap"]["ros__parameters"]
     check("parameters of a user stay", found["footprint"] == "[]" and found["resolution"] == 0.1 and "amcl" in both)
     check("the layers are ours", found["plugins"][0] == "static_layer" and found["track_unknown_space"], found["plugins"])

@@ -83,7 +83,7 @@ async function loadedByThree(name: string, base64: string): Promise<WEBGPU.Objec
   return scene;
 }
 
-/// Each view of a file drawn by three -> PNGs.
+/// Each view of a file drawn by three -> images as data URLs.
 async function drawnByThree(name: string, base64: string, views: View[]): Promise<{ n: number; drawn: string[] }> {
   const loaded = await loadedByThree(name, base64);
   const canvas = document.createElement("canvas");

@@ -60,8 +60,9 @@ pub(crate) fn answer(
 ) -> Result<GetDistancesResponse, String> {
     let volume =
         volume.ok_or("there is no volume yet: status.warnings says why, if it is not to come")?;
-    let n = asked.points.len() / 3;
-    if asked.points.len() % 3 != 0 {
+    let (points, rest) = asked.points.as_chunks::<3>();
+    let n = points.len();
+    if !rest.is_empty() {
         return Err(format!(
             "{} numbers are no points of x y z",
             asked.points.len()
@@ -94,10 +95,7 @@ pub(crate) fn answer(
             volume.map_frame, volume.level_frame
         ));
     };
-    let points: Vec<DVec3> = asked
-        .points
-        .as_chunks::<3>()
-        .0
+    let points: Vec<DVec3> = points
         .iter()
         .map(|p| level_from_frame * DVec3::from_array(p.map(f64::from)))
         .collect();

@@ -39,7 +39,7 @@ const WHOLE_SECS: f64 = 5.0;
 
 /// A grid, and where it lies.
 #[derive(Debug, Clone)]
-pub struct PlacedGrid {
+pub struct LevelGrid {
     pub grid: Grid,
     pub stamp: Stamp,
     /// Of the ground's normal; identity: the map frame is level.
@@ -56,7 +56,7 @@ pub struct GridStream {
     frames: Arc<FrameCells>,
     reports: Arc<Reports>,
     /// As readers have it.
-    published: Option<PlacedGrid>,
+    published: Option<LevelGrid>,
     since_whole: Stopwatch,
     /// Updates went out since the last whole one.
     is_ahead: bool,
@@ -87,7 +87,9 @@ impl GridStream {
 
     /// Of the last grid: the next one is no smaller.
     pub fn extent(&self) -> Option<Extent> {
-        self.published.as_ref().map(|placed| placed.grid.extent)
+        self.published
+            .as_ref()
+            .map(|level_grid| level_grid.grid.extent)
     }
 
     /// Why there is no grid; empty while there is one, or none is wanted.
@@ -120,48 +122,52 @@ impl GridStream {
     pub fn publish(
         &mut self,
         publisher: &Publisher,
-        placed: PlacedGrid,
+        level_grid: LevelGrid,
     ) -> Result<(), PublishError> {
-        let frame = self.frame_of(placed.level_from_map);
-        let header = || Header::new(placed.stamp, &frame);
+        let frame = self.frame_of(level_grid.level_from_map);
+        let header = || Header::new(level_grid.stamp, &frame);
         let before = self.published.take();
         let before = before.filter(|before| {
-            before.grid.extent == placed.grid.extent
-                && before.level_from_map == placed.level_from_map
+            before.grid.extent == level_grid.grid.extent
+                && before.level_from_map == level_grid.level_from_map
         });
         let part = before
             .as_ref()
-            .map(|before| placed.grid.changed_since(&before.grid));
+            .map(|before| level_grid.grid.changed_since(&before.grid));
         let is_whole = match part {
             None => true,
             Some(None) => self.is_ahead && self.since_whole.secs() >= WHOLE_SECS,
             Some(Some([_, _, width, height])) => {
-                let share = (width * height) as f64 / placed.grid.cells.len() as f64;
+                let share = (width * height) as f64 / level_grid.grid.cells.len() as f64;
                 share > MAX_UPDATE_SHARE || self.since_whole.secs() >= WHOLE_SECS
             }
         };
-        let is_turned = before.is_none() && placed.level_from_map != DQuat::IDENTITY;
+        let is_turned = before.is_none() && level_grid.level_from_map != DQuat::IDENTITY;
         if is_turned {
-            publisher.send(&self.level_transform(&placed, &frame)?)?;
+            publisher.send(&self.level_transform(&level_grid, &frame)?)?;
         }
         if is_whole {
-            publisher.send(&Sample::of(&GRID, placed.stamp, &whole(&placed, header()))?)?;
+            publisher.send(&Sample::of(
+                &GRID,
+                level_grid.stamp,
+                &whole(&level_grid, header()),
+            )?)?;
             (self.since_whole, self.is_ahead) = (Stopwatch::start(), false);
         } else if let Some(Some(part)) = part {
-            let update = update(&placed.grid, part, header());
-            publisher.send(&Sample::of(&UPDATES, placed.stamp, &update)?)?;
+            let update = update(&level_grid.grid, part, header());
+            publisher.send(&Sample::of(&UPDATES, level_grid.stamp, &update)?)?;
             self.is_ahead = true;
         }
         if is_whole || part.flatten().is_some() {
             publisher.observe(&Event::Grid {
-                grid: &placed.grid,
-                map_from_grid: placed.level_from_map.inverse(),
-                ground: placed.ground,
+                grid: &level_grid.grid,
+                map_from_grid: level_grid.level_from_map.inverse(),
+                ground: level_grid.ground,
             });
-            let slice = distances(&placed, header());
-            publisher.send(&Sample::of(&DISTANCES, placed.stamp, &slice)?)?;
+            let slice = distances(&level_grid, header());
+            publisher.send(&Sample::of(&DISTANCES, level_grid.stamp, &slice)?)?;
         }
-        self.published = Some(placed);
+        self.published = Some(level_grid);
         Ok(())
     }
 
@@ -174,21 +180,21 @@ impl GridStream {
         }
     }
 
-    fn level_transform(&self, placed: &PlacedGrid, frame: &str) -> Result<Sample, PublishError> {
-        let pose = Rigid::new(placed.level_from_map.inverse(), glam::DVec3::ZERO);
+    fn level_transform(&self, level_grid: &LevelGrid, frame: &str) -> Result<Sample, PublishError> {
+        let pose = Rigid::new(level_grid.level_from_map.inverse(), glam::DVec3::ZERO);
         let transform = TransformStamped {
-            header: Header::new(placed.stamp, &self.params.map_frame),
+            header: Header::new(level_grid.stamp, &self.params.map_frame),
             child_frame_id: frame.to_owned(),
             transform: pose.into(),
         };
         let transforms = vec![transform];
-        Sample::of(&TF_STATIC, placed.stamp, &TfMessage { transforms })
+        Sample::of(&TF_STATIC, level_grid.stamp, &TfMessage { transforms })
     }
 }
 
 /// As Nav2's static layer takes it: the origin on a multiple of the resolution, without a rotation.
-fn whole(placed: &PlacedGrid, header: Header) -> OccupancyGrid {
-    let grid = &placed.grid;
+fn whole(level_grid: &LevelGrid, header: Header) -> OccupancyGrid {
+    let grid = &level_grid.grid;
     let origin = Rigid::new(DQuat::IDENTITY, grid.origin().extend(0.0));
     OccupancyGrid {
         info: MapMetaData {
@@ -215,8 +221,8 @@ fn update(grid: &Grid, part: [usize; 4], header: Header) -> OccupancyGridUpdate 
     }
 }
 
-fn distances(placed: &PlacedGrid, header: Header) -> DistanceMapSlice {
-    let grid = &placed.grid;
+fn distances(level_grid: &LevelGrid, header: Header) -> DistanceMapSlice {
+    let grid = &level_grid.grid;
     let origin = grid.origin();
     DistanceMapSlice {
         header,
@@ -226,7 +232,7 @@ fn distances(placed: &PlacedGrid, header: Header) -> DistanceMapSlice {
         origin: Vector3 {
             x: origin.x,
             y: origin.y,
-            z: placed.height,
+            z: level_grid.height,
         },
         unknown_value: UNKNOWN_DISTANCE,
         data: signed_distances(grid, MAX_DISTANCE),

@@ -32,7 +32,7 @@ const MORE_VIEWS: f64 = 1.5;
 pub struct KeyframeDepth {
     pub id: u32,
     /// Metres; the scale is metres per unit of the depth.
-    pub map_from_cam: Similarity,
+    pub map_from_camera: Similarity,
     /// Of the image, at any size.
     pub intrinsics: Intrinsics,
     /// Units of the map.
@@ -146,7 +146,7 @@ impl Volume {
     }
 
     fn set_keyframe(&mut self, keyframe: &KeyframeDepth) -> Result<(), VolumeError> {
-        let (pose, k) = (keyframe.map_from_cam, &keyframe.intrinsics);
+        let (pose, k) = (keyframe.map_from_camera, &keyframe.intrinsics);
         let is_sound = pose.is_finite()
             && pose.scale > 0.0
             && (pose.rotation.length() - 1.0).abs() < 1e-3
@@ -221,11 +221,11 @@ impl Volume {
             + (new.scale / old.scale - 1.0).abs() * depth
     }
 
-    fn in_level(&self, map_from_cam: &Similarity) -> Similarity {
+    fn in_level(&self, map_from_camera: &Similarity) -> Similarity {
         Similarity {
-            scale: map_from_cam.scale,
-            rotation: self.level_from_map * map_from_cam.rotation,
-            translation: self.level_from_map * map_from_cam.translation,
+            scale: map_from_camera.scale,
+            rotation: self.level_from_map * map_from_camera.rotation,
+            translation: self.level_from_map * map_from_camera.translation,
         }
     }
 

@@ -23,7 +23,7 @@ const METRES: f64 = 2.5;
 fn keyframes(world: &World, poses: &[Similarity]) -> Vec<KeyframeDepth> {
     let keyframe = |(id, pose): (usize, &Similarity)| KeyframeDepth {
         id: id as u32,
-        map_from_cam: *pose,
+        map_from_camera: *pose,
         intrinsics: CAMERA,
         depth: Arc::new(world.depth(pose)),
     };
@@ -51,7 +51,7 @@ fn fused(keyframes: &[KeyframeDepth]) -> Volume {
 
 fn grid_of(volume: &mut Volume) -> Grid {
     let params = volume.params().clone();
-    let ground = volume.ground().unwrap();
+    let ground = volume.ground().expect("a ground");
     let voxel = (ground.height / params.resolution).floor() as i32;
     grid(volume.columns(), voxel, &params, None, IVec2::ZERO)
 }
@@ -122,7 +122,10 @@ fn the_grid_of_a_room_is_the_room() {
     let at_95 = errors[errors.len() * 95 / 100];
     assert!(at_95 <= 0.05, "{at_95}");
     let n_unknown = grid.cells.iter().filter(|c| **c == UNKNOWN).count();
-    let marked = distances.iter().filter(|d| **d == UNKNOWN_DISTANCE).count();
+    let marked = distances
+        .iter()
+        .filter(|d| **d > UNKNOWN_DISTANCE / 2.0)
+        .count();
     assert_eq!(n_unknown, marked);
 }
 
@@ -247,9 +250,9 @@ fn a_corrected_trajectory_gives_the_volume_of_the_right_one() {
     // The second half is off by a drift, as before a loop closes.
     let mut wrong = right.clone();
     for keyframe in &mut wrong[30..] {
-        keyframe.map_from_cam.translation += DVec3::new(0.4, -0.3, 0.0);
-        keyframe.map_from_cam.rotation =
-            DQuat::from_rotation_z(0.1) * keyframe.map_from_cam.rotation;
+        keyframe.map_from_camera.translation += DVec3::new(0.4, -0.3, 0.0);
+        keyframe.map_from_camera.rotation =
+            DQuat::from_rotation_z(0.1) * keyframe.map_from_camera.rotation;
     }
     let mut volume = fused(&wrong);
     let doubled = grid_of(&mut volume);
@@ -304,7 +307,7 @@ fn a_tilted_map_is_levelled() {
     let tilt = DQuat::from_rotation_x(0.15);
     let mut tilted = keyframes(&world, &round());
     for keyframe in &mut tilted {
-        let pose = &mut keyframe.map_from_cam;
+        let pose = &mut keyframe.map_from_camera;
         pose.rotation = tilt * pose.rotation;
         pose.translation = tilt * pose.translation;
     }
@@ -333,11 +336,11 @@ fn hostile_keyframes_stay_out() {
         change(&mut keyframe);
         all.push(keyframe);
     };
-    bad(&|k| k.map_from_cam.translation.x = f64::NAN);
-    bad(&|k| k.map_from_cam.scale = 0.0);
-    bad(&|k| k.map_from_cam.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 3.0));
+    bad(&|k| k.map_from_camera.translation.x = f64::NAN);
+    bad(&|k| k.map_from_camera.scale = 0.0);
+    bad(&|k| k.map_from_camera.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 3.0));
     bad(&|k| k.intrinsics.fx = 0.0);
-    bad(&|k| k.map_from_cam.translation = DVec3::splat(1e15));
+    bad(&|k| k.map_from_camera.translation = DVec3::splat(1e15));
     bad(&|k| k.depth = Arc::new(DepthMap::none()));
     bad(&|k| {
         let mut depth = (*k.depth).clone();
@@ -354,7 +357,7 @@ fn hostile_keyframes_stay_out() {
     // A kilometre away is far, but no fault; the grid stays bounded.
     let mut away = all[0].clone();
     away.id = 50;
-    away.map_from_cam.translation.x += 1000.0;
+    away.map_from_camera.translation.x += 1000.0;
     let mut with: Vec<KeyframeDepth> = all[..good].to_vec();
     with.push(away);
     let mut volume = fused(&with);

@@ -1,7 +1,7 @@
 //! Boxes in a room, and what a camera sees of them.
 
 use glam::{DQuat, DVec2, DVec3, IVec2};
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
@@ -126,9 +126,9 @@ impl World {
 
     /// Cells of 5 cm whose standing surface two cameras or more have seen within `range`, at nine degrees or more.
     pub(crate) fn seen_obstacles(&self, poses: &[Similarity], range: f64) -> Vec<IVec2> {
-        let mut seen: HashMap<IVec2, u32> = HashMap::new();
+        let mut seen: BTreeMap<[i32; 2], u32> = BTreeMap::new();
         for pose in poses {
-            let mut own = std::collections::HashSet::new();
+            let mut own = std::collections::BTreeSet::new();
             let (w, h) = (CAMERA.width_px, CAMERA.height_px);
             for at in 0..w * h {
                 let pixel = DVec2::new(f64::from(at % w) + 0.5, f64::from(at / w) + 0.5);
@@ -138,7 +138,7 @@ impl World {
                 // Sine of the angle between ray and surface: nobody sees along a surface.
                 let sine = self.distance(hit - along.normalize() * 0.01) / 0.01;
                 if z < range && sine > 0.15 && hit.z > 0.2 && hit.z < 1.45 {
-                    own.insert((hit.truncate() / 0.05).floor().as_ivec2());
+                    own.insert((hit.truncate() / 0.05).floor().as_ivec2().to_array());
                 }
             }
             for cell in own {
@@ -146,6 +146,6 @@ impl World {
             }
         }
         let twice = seen.into_iter().filter(|(_, n)| *n >= 2);
-        twice.map(|(cell, _)| cell).collect()
+        twice.map(|(cell, _)| IVec2::from_array(cell)).collect()
     }
 }
