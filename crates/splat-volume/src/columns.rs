@@ -1,4 +1,4 @@
-//! Voxels -> for each cell of the ground plane a column of bits: where surfaces were seen, and where free space.
+//! Voxels -> for each cell of the ground plane columns of bits: where surfaces were seen, where free space, and what is behind surfaces.
 
 use std::collections::HashMap;
 
@@ -17,6 +17,8 @@ const N_CELLS: usize = (SIDE * SIDE) as usize;
 pub struct Column {
     pub surface: u128,
     pub free: u128,
+    /// Behind surfaces.
+    pub inside: u128,
 }
 
 /// The columns of all cells that have voxels, in tiles as wide as a block.
@@ -69,7 +71,8 @@ impl Columns {
                     match state {
                         State::Surface => column.surface |= 1 << bit,
                         State::Free => column.free |= 1 << bit,
-                        State::Inside | State::Unknown => {}
+                        State::Inside => column.inside |= 1 << bit,
+                        State::Unknown => {}
                     }
                 }
             }

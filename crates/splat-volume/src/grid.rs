@@ -291,7 +291,7 @@ impl Rules {
         // Between free voxels something may hang or stand that nobody has seen well enough: the top of a table.
         let highest = HEIGHT - free.leading_zeros() as i32;
         let between = bits(ground + self.low + 1 + n_unseen.max(0), highest);
-        let is_whole = between & !free == 0;
+        let is_whole = between & !free == 0 && column.inside & band == 0;
         let is_seen = f64::from(free.count_ones()) >= share * f64::from(band.count_ones());
         if free != 0 && begins_low && is_whole && is_seen {
             FREE
@@ -322,7 +322,16 @@ mod tests {
     fn a_column_is_judged_above_its_ground() {
         let params = GridParams::default();
         let rules = Rules::new(&params);
-        let judge = |surface: u128, free: u128| rules.judge(&Column { surface, free }, 40);
+        let judge = |surface: u128, free: u128| {
+            rules.judge(
+                &Column {
+                    surface,
+                    free,
+                    inside: 0,
+                },
+                40,
+            )
+        };
         let air = bits(42, 80);
         assert_eq!(judge(1 << 40, air), FREE);
         assert_eq!(judge(1 << 41, air), FREE, "a bump of a voxel");
@@ -340,6 +349,14 @@ mod tests {
             UNKNOWN,
             "what stands below was not seen"
         );
+        let behind = Column {
+            surface: 1 << 40,
+            free: air & bits(0, 60),
+            inside: 1 << 65,
+        };
+        assert_eq!(rules.judge(&behind, 40), UNKNOWN, "something is in there");
+        let table = air & !bits(54, 57);
+        assert_eq!(judge(1 << 40, table), UNKNOWN, "seen badly");
         assert_eq!(judge(1 << 30, air), OCCUPIED, "stairs that go down");
         assert_eq!(judge(0, air | bits(20, 38)), OCCUPIED, "a hole");
     }
