@@ -159,10 +159,7 @@ pub fn fused(keyframes: &[KeyframeDepth], params: &GridParams) -> Volume {
 
 /// Cells of all that was fused.
 pub fn grid_of(volume: &mut Volume) -> Result<Grid, PlannerError> {
-    let ground = volume.ground().ok_or(PlannerError::NoGround)?;
-    let params = volume.params().clone();
-    let voxel = (ground.height / params.resolution).floor() as i32;
-    Ok(grid(volume.columns(), voxel, &params, None, IVec2::ZERO))
+    grid(volume, None, IVec2::ZERO).ok_or(PlannerError::NoGround)
 }
 
 /// Truncated signed distances as a NumPy array of 32-bit floats, indices z, y, x; NaN where nothing was seen.

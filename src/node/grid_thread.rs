@@ -118,10 +118,12 @@ impl GridStage {
         let resolution = self.params.resolution;
         let focus = (newest / resolution).floor().truncate().as_ivec2();
         let before = self.stream.extent();
-        let voxel = (ground.height / resolution).floor() as i32;
-        let (params, columns) = (&self.params, self.volume.columns());
+        let Some(grid) = grid(&mut self.volume, before, focus) else {
+            return;
+        };
+        let params = &self.params;
         let level_grid = LevelGrid {
-            grid: grid(columns, voxel, params, before, focus),
+            grid,
             stamp: input.snapshot.stamp,
             ground: ground.height,
             height: ground.height + (params.min_height + params.max_height) / 2.0,

@@ -7,12 +7,16 @@ use glam::IVec2;
 
 use crate::localise::run;
 use splat_mapper::formats::planner_map;
+use splat_mapper::node::open_source::open;
+use splat_mapper::params::settings::Settings;
 use splat_msgs::ros::navigation::{DistanceMapSlice, OccupancyGrid, OccupancyGridUpdate};
 use splat_msgs::ros::{self, Header};
 use splat_slam::mapper::keyframes::image_codec::Content;
 use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint};
 use splat_synth::settings::{SceneKind, SynthSettings};
 use splat_synth::take::Take;
+use splat_types::depth::DepthMap;
+use splat_types::frame::Frame;
 use splat_types::image::RgbImage;
 use splat_types::snapshot::Scale;
 use splat_volume::grid::{FREE, Grid, OCCUPIED, UNKNOWN};
@@ -160,6 +164,77 @@ fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
         };
     }
     map
+}
+
+/// The same keyframes with the depth of a depth camera, where a frame has one.
+fn measured(map: &Checkpoint, frames: &[Frame]) -> Checkpoint {
+    let unit = map.snapshot.scale.metres_per_unit.unwrap();
+    let mut map = map.clone();
+    for view in &mut map.views {
+        let poses = map.snapshot.poses.iter();
+        let pose = poses.clone().find(|p| p.keyframe_id == view.keyframe_id);
+        let pose = pose.unwrap();
+        let k = pose.intrinsics;
+        let (image, _) = view.unpacked((k.width_px, k.height_px)).unwrap();
+        let frame = frames.iter().find(|frame| frame.stamp == pose.stamp);
+        let depth = frame.and_then(|frame| frame.sensor_depth.as_deref().cloned());
+        let mut depth = depth.unwrap_or_else(DepthMap::none);
+        depth.scale(1.0 / unit);
+        view.content = Content::InMemory {
+            image: Arc::new(image),
+            depth: Arc::new(depth),
+        };
+    }
+    map
+}
+
+#[test]
+fn a_kitchen_from_stereo_is_that_of_a_depth_camera() {
+    let Some(scene) = crate::scenes::scene("kitchen7s_rgbd") else {
+        return;
+    };
+    let bag = scene.join("rosbag2");
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let (input, to) = (bag.to_str().unwrap(), out.to_str().unwrap());
+    let output = run(&[
+        "replay",
+        input,
+        "--out",
+        to,
+        "--backend",
+        "cpu",
+        "--max-side",
+        "320",
+        "--steps",
+        "1",
+    ]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+    let source = Settings::shipped().params().unwrap().source;
+    let mut source = open(input, &source, 0).unwrap();
+    let frames: Vec<Frame> = std::iter::from_fn(|| source.next()).collect();
+    let grid_of = |map: &Checkpoint| {
+        let mut volume = planner_map::volume(map, &GridParams::default()).unwrap();
+        planner_map::grid_of(&mut volume).unwrap()
+    };
+    let (stereo, sensor) = (grid_of(&map), grid_of(&measured(&map, &frames)));
+    let [mut n_decided, mut n_agree] = [0, 0];
+    for at in 0..stereo.cells.len() {
+        let width = stereo.extent.width as usize;
+        let cell = stereo.extent.first + IVec2::new((at % width) as i32, (at / width) as i32);
+        let (found, other) = (stereo.cell(cell), sensor.cell(cell));
+        if found != UNKNOWN && other != UNKNOWN {
+            n_decided += 1;
+            n_agree += i32::from(is_near(&sensor, cell, found));
+        }
+    }
+    eprintln!(
+        "{n_agree} of {n_decided} agree; stereo knows {:?}, sensor {:?}",
+        stereo.known(),
+        sensor.known()
+    );
 }
 
 /// Whether a cell near this one, or itself, has the value.

@@ -9,6 +9,7 @@ use glam::{DVec2, IVec2};
 
 use crate::columns::{Column, Columns, HEIGHT};
 use crate::params::GridParams;
+use crate::volume::Volume;
 use crate::voxels::SIDE;
 
 pub const FREE: i8 = 0;
@@ -143,8 +144,16 @@ impl Grid {
     }
 }
 
-/// Cells of all tiles; `ground` is the index of the ground plane's voxel along z.
-pub fn grid(
+/// Cells of all that was fused, no smaller than `before` and around the cell `focus` where they are too many; `None` while no ground was found.
+pub fn grid(volume: &mut Volume, before: Option<Extent>, focus: IVec2) -> Option<Grid> {
+    let ground = volume.ground()?;
+    let params = volume.params().clone();
+    let voxel = (ground.height / params.resolution).floor() as i32;
+    Some(of_columns(volume.columns(), voxel, &params, before, focus))
+}
+
+/// `ground` is the index of the ground plane's voxel along z.
+fn of_columns(
     columns: &Columns,
     ground: i32,
     params: &GridParams,

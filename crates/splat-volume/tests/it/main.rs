@@ -50,10 +50,7 @@ fn fused(keyframes: &[KeyframeDepth]) -> Volume {
 }
 
 fn grid_of(volume: &mut Volume) -> Grid {
-    let params = volume.params().clone();
-    let ground = volume.ground().expect("a ground");
-    let voxel = (ground.height / params.resolution).floor() as i32;
-    grid(volume.columns(), voxel, &params, None, IVec2::ZERO)
+    grid(volume, None, IVec2::ZERO).expect("a ground")
 }
 
 /// Cells whose middle was seen, and the world's own word on them.
