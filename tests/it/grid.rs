@@ -230,11 +230,8 @@ fn a_kitchen_from_stereo_is_that_of_a_depth_camera() {
             n_agree += i32::from(is_near(&sensor, cell, found));
         }
     }
-    eprintln!(
-        "{n_agree} of {n_decided} agree; stereo knows {:?}, sensor {:?}",
-        stereo.known(),
-        sensor.known()
-    );
+    let is_alike = f64::from(n_agree) >= 0.95 * f64::from(n_decided);
+    assert!(n_decided > 1000 && is_alike, "{n_agree} of {n_decided}");
 }
 
 /// Whether a cell near this one, or itself, has the value.
