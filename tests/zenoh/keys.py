@@ -24,6 +24,10 @@ TOPICS = [
     ("/splat_mapper/path", "nav_msgs::msg::dds_::Path_", latched(1)),
     ("/splat_mapper/cloud", "sensor_msgs::msg::dds_::PointCloud2_", latched(1)),
     ("/splat_mapper/keyframe_cloud", "sensor_msgs::msg::dds_::PointCloud2_", NEWEST),
+    ("/splat_mapper/grid", "nav_msgs::msg::dds_::OccupancyGrid_", latched(1)),
+    ("/splat_mapper/grid_updates", "map_msgs::msg::dds_::OccupancyGridUpdate_", reliable(10)),
+    ("/splat_mapper/distance_slice", "nvblox_msgs::msg::dds_::DistanceMapSlice_", latched(1)),
+    ("/tf_static", "tf2_msgs::msg::dds_::TFMessage_", latched(1)),
     ("/splat_mapper/frusta", "visualization_msgs::msg::dds_::MarkerArray_", latched(1)),
     ("/splat_mapper/keyframes", "splat_mapper_msgs::msg::dds_::KeyframeArray_", latched(64)),
     ("/splat_mapper/splats/manifest", "splat_mapper_msgs::msg::dds_::SplatManifest_", latched(1)),
@@ -45,6 +49,7 @@ SERVICES = [
     ("/splat_mapper/resume", "std_srvs::srv::dds_::Trigger_"),
     ("/splat_mapper/get_splats", "splat_mapper_msgs::srv::dds_::GetSplats_"),
     ("/splat_mapper/render_view", "splat_mapper_msgs::srv::dds_::RenderView_"),
+    ("/splat_mapper/get_distances", "splat_mapper_msgs::srv::dds_::GetDistances_"),
 ]
 
 

@@ -230,6 +230,9 @@ def check_services(session, report):
     expect(seen(64, 48, "map").success and seen(64, 48, "splat_map").success, "render_view takes poses in map and splat_map")
     unknown = seen(64, 48, "odom")
     expect(not unknown.success and "splat_map" in unknown.message, f"render_view names the frames it knows: {unknown.message}")
+    asked = {"frame_id": "odom", "points": numpy.zeros(3, dtype=numpy.float32), "max_distance": 0.0}
+    refused = own("get_distances", "GetDistances", asked, session)
+    expect(not refused.success and refused.message, f"get_distances says why not: {refused.message}")
     expect(trigger("pause", session) and trigger("resume", session), "pause and resume")
 
 
