@@ -1,4 +1,4 @@
-//! Plans a way for a round robot on the map of a running mapper, over zenoh, as any client can: A* on `distance_slice`, straightened, and checked in space by
+//! Plans a way for a round robot on the map of a running mapper, over zenoh, as any client can: A* on `distance_slice`, shortened, and checked in space by
 //! `get_distances`.
 #![allow(clippy::print_stdout, reason = "an example speaks to the terminal")]
 
@@ -131,7 +131,7 @@ impl Slice {
     }
 
     /// As few corners as the radius allows.
-    fn straightened(&self, way: &[IVec2], radius: f64) -> Vec<DVec2> {
+    fn shortened(&self, way: &[IVec2], radius: f64) -> Vec<DVec2> {
         let points: Vec<DVec2> = way.iter().map(|cell| self.middle(*cell)).collect();
         let mut kept = vec![0];
         while let Some(&at) = kept.last().filter(|at| **at + 1 < points.len()) {
@@ -287,7 +287,7 @@ fn main() -> Result<()> {
     let Some(way) = slice.way(from, to, args.radius) else {
         bail!("no way: what is known and free between the two places is narrower than the robot");
     };
-    let way = slice.straightened(&way, args.radius);
+    let way = slice.shortened(&way, args.radius);
     for point in &way {
         println!("{:.3} {:.3}", point.x, point.y);
     }

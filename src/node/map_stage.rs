@@ -1,4 +1,4 @@
-//! The stages between the queues: each is a struct with push-like methods and knows no threads.
+//! Geometry -> the map, its steps and its snapshots: a struct with push-like methods that knows no threads.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,22 +18,18 @@ use crate::params::params::Params;
 use splat_engine::error::EngineError;
 use splat_geometry::answer::GeometryBatch;
 use splat_io::queue::Sender;
-use splat_ros::output::{Output, OutputHandles};
+use splat_ros::output::Output;
 use splat_ros::reports::Reports;
-use splat_ros::status::{MapStatus, SelectStatus};
+use splat_ros::status::MapStatus;
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::params::MapperParams;
 use splat_slam::mapper::train::schedule::{self, End};
-use splat_slam::select::selector::{Batcher, Selector};
 use splat_slam::track::landmarks::KeyframeView;
-use splat_types::frame::{Batch, Frame};
+use splat_types::frame::Batch;
 use splat_types::load_shed::LoadShed;
 use splat_types::snapshot::Snapshot;
-use splat_types::time::{Stamp, Stopwatch};
-use splat_types::transform::Rigid;
+use splat_types::time::Stopwatch;
 
-/// Stamps beyond this many are not kept for trajectory.tum: two weeks at 30 Hz would be 290 MB.
-const MAX_STAMPS: usize = 10_000_000;
 /// Steps between looks at the clock, the queue and the stop.
 const STEPS_AT_ONCE: u64 = 10;
 /// The same live, where a keyframe waits for them.
@@ -50,17 +46,6 @@ const LIVE_STEPS_PER_KEYFRAME: u64 = 600;
 /// Takes a snapshot for everybody, or only word of how far the run is.
 pub(crate) type Publish<'a> = dyn FnMut(Option<Outgoing>, Progress) + 'a;
 
-/// Frames -> batches.
-#[derive(Debug)]
-pub(crate) struct SelectStage {
-    selector: Selector,
-    batcher: Batcher,
-    reports: Option<Arc<Reports>>,
-    pub(crate) n_selected: usize,
-    pub(crate) frame_stamps: Vec<Stamp>,
-    pub(crate) truth: Vec<(Stamp, Rigid)>,
-}
-
 /// Geometry -> the map, its steps and its snapshots.
 pub(crate) struct MapStage {
     pub(crate) map: Mapper,
@@ -74,11 +59,17 @@ pub(crate) struct MapStage {
     reports: Option<Arc<Reports>>,
     pub(crate) autosave: Option<Autosave>,
     pub(crate) recovery: Recovery,
-    /// Keyframes go out with their depth.
-    has_grid: bool,
-    since_snapshot: Stopwatch,
+    snapshots: Snapshots,
     grace: ShutdownTimeout,
     pub(crate) figures: MapFigures,
+}
+
+/// When one goes out, and with what.
+#[derive(Debug)]
+struct Snapshots {
+    since_last: Stopwatch,
+    /// Keyframes go along with their depth.
+    has_grid: bool,
 }
 
 /// Live: when steps are made, and by which threads.
@@ -124,56 +115,6 @@ impl MapFigures {
     }
 }
 
-impl SelectStage {
-    pub(crate) fn new(params: &Params, first_id: u32, output: Option<&OutputHandles>) -> Self {
-        Self {
-            selector: Selector::new(params.select.clone()).counting_from(first_id),
-            batcher: Batcher::new(&params.select),
-            reports: output.map(|output| Arc::clone(&output.reports)),
-            n_selected: 0,
-            frame_stamps: Vec::new(),
-            truth: Vec::new(),
-        }
-    }
-
-    /// Of a source of so many photos; `None` for the frames of a camera.
-    pub(crate) fn of_photos(mut self, n_photos: Option<u64>) -> Self {
-        self.selector = self.selector.of_photos(n_photos);
-        self
-    }
-
-    pub(crate) fn push(&mut self, frame: Frame) -> Option<Batch> {
-        if self.frame_stamps.len() < MAX_STAMPS {
-            self.frame_stamps.push(frame.stamp);
-        }
-        let keyframe = self.selector.push(frame)?;
-        self.n_selected += 1;
-        let n_keyframes = self.n_selected as u64;
-        self.report(|status| status.n_keyframes = n_keyframes);
-        if let Some(truth) = keyframe.frame.truth {
-            self.truth.push((keyframe.frame.stamp, truth));
-        }
-        self.batcher.push(keyframe)
-    }
-
-    /// Changes selection's part of the status; nothing where no status goes out.
-    pub(crate) fn report(&self, change: impl FnOnce(&mut SelectStatus)) {
-        if let Some(reports) = &self.reports {
-            reports.select.update(change);
-        }
-    }
-
-    /// Keyframes that were in no batch so far.
-    pub(crate) fn n_new(&self) -> usize {
-        self.batcher.n_new()
-    }
-
-    /// A batch that is not full; `None` when every keyframe has been in one.
-    pub(crate) fn finish(&mut self) -> Option<Batch> {
-        self.batcher.finish()
-    }
-}
-
 impl MapStage {
     pub(crate) fn new(
         map: Mapper,
@@ -197,11 +138,13 @@ impl MapStage {
             grace: ShutdownTimeout::new(stop),
             n_frames,
             fitter: None,
-            has_grid: params.grid.enabled && reports.is_some(),
+            snapshots: Snapshots {
+                since_last: Stopwatch::start(),
+                has_grid: params.grid.enabled && reports.is_some(),
+            },
             reports,
             autosave: None,
             recovery,
-            since_snapshot: Stopwatch::start(),
             figures: MapFigures::default(),
         }
     }
@@ -486,7 +429,7 @@ impl MapStage {
     }
 
     pub(crate) fn snapshot_if_due(&mut self, publish: &mut Publish<'_>) {
-        let is_due = self.since_snapshot.secs() >= self.params.map.snapshot_secs;
+        let is_due = self.snapshots.since_last.secs() >= self.params.map.snapshot_secs;
         if is_due
             && self.map.n_splats() > 0
             && let Some(snapshot) = self.snapshot()
@@ -508,7 +451,7 @@ impl MapStage {
         publish: &mut Publish<'_>,
     ) {
         self.report(|status| status.n_splats = snapshot.splats.len() as u64);
-        let grid = self.has_grid.then(|| GridInput {
+        let grid = self.snapshots.has_grid.then(|| GridInput {
             keyframes: self.keyframe_views(),
             snapshot: Arc::clone(&snapshot),
             is_last: progress.has_ended,
@@ -530,7 +473,7 @@ impl MapStage {
             reports.correction.add(moved);
         }
         let snapshot = self.on_map(Mapper::snapshot)?;
-        self.since_snapshot = Stopwatch::start();
+        self.snapshots.since_last = Stopwatch::start();
         self.figures.shown(&snapshot);
         Some(snapshot)
     }

@@ -38,6 +38,8 @@ mod quality;
 
 mod milestones;
 
+mod select_stage;
+
 mod map_stage;
 
 mod open;

@@ -8,11 +8,12 @@ use crate::node::backpressure::Backpressure;
 use crate::node::geometry_thread::{GeometryStage, GeometryTally, run_geometry};
 use crate::node::grid_thread::{GridInput, GridStage, run_grid};
 use crate::node::job::{InputSummary, Job, Outcome, Progress, StageSecs, model, spawn};
-use crate::node::map_stage::{MapStage, Publish, SelectStage};
+use crate::node::map_stage::{MapStage, Publish};
 use crate::node::publish_threads::{
     LiveStage, Outgoing, OutputStages, SnapshotStage, run_live, run_publisher, stages_of,
     streams_of,
 };
+use crate::node::select_stage::SelectStage;
 use crate::node::source_thread::SourceStage;
 use crate::node::threads::{Answer, Niceness, joined, own_pool, run_select, run_source};
 use crate::node::track_thread::{KeyframeUpdate, TrackStage, TrackingSummary, run_track};

@@ -8,7 +8,7 @@ use anyhow::anyhow;
 
 use crate::machine::priority;
 use crate::node::backpressure::Backpressure;
-use crate::node::map_stage::SelectStage;
+use crate::node::select_stage::SelectStage;
 use crate::node::source_thread::SourceStage;
 use crate::node::track_thread::{TrackerInput, report};
 use splat_geometry::answer::GeometryBatch;
