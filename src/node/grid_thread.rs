@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::node::rate_limited::RateLimitedLog;
 use splat_io::queue::Receiver;
 use splat_ros::grid_stream::{GridStream, LevelGrid};
 use splat_ros::publisher::Publisher;
@@ -18,8 +19,6 @@ use splat_volume::volume::{KeyframeDepth, Volume};
 
 /// Keyframes that are fused between looks at whether there are newer ones.
 const KEYFRAMES_AT_ONCE: usize = 8;
-/// Seconds between warnings.
-const LOG_SECS: f64 = 10.0;
 
 /// All keyframes as a snapshot has them.
 #[derive(Debug, Clone)]
@@ -38,7 +37,7 @@ pub(crate) struct GridStage {
     stream: GridStream,
     pool: Option<rayon::ThreadPool>,
     since_grid: Option<Stopwatch>,
-    since_warning: Option<Stopwatch>,
+    rate_limited: RateLimitedLog,
 }
 
 impl GridStage {
@@ -51,7 +50,7 @@ impl GridStage {
             stream,
             pool: None,
             since_grid: None,
-            since_warning: None,
+            rate_limited: RateLimitedLog::default(),
         }
     }
 
@@ -66,13 +65,13 @@ impl GridStage {
         if metres.is_none() && !self.params.allow_unscaled {
             let reason = "the scale is unknown, so that heights and distances are; give a baseline, depth, odometry or \
                           scale.camera_height, or set grid.allow_unscaled";
-            return self.stream.report(reason, self.volume.bytes());
+            return self.stream.report(reason);
         }
         if self.map_id != Some(input.snapshot.map_id) {
             self.volume = Volume::new(&self.params);
             self.map_id = Some(input.snapshot.map_id);
         }
-        let keyframes = keyframes_of(input, &self.stream.map_from_world(metres));
+        let keyframes = keyframes_of(&input.keyframes, &self.stream.map_from_world(metres));
         let faults = self.volume.set_keyframes(&keyframes);
         self.warn_of(&faults);
         loop {
@@ -101,7 +100,7 @@ impl GridStage {
         self.stream.keep_volume(&self.publisher, voxels, level, at);
         let Some(ground) = self.volume.ground() else {
             let reason = "no ground was seen: a plane below the camera that leans by less than 25 degrees from level";
-            return self.stream.report(reason, self.volume.bytes());
+            return self.stream.report(reason);
         };
         self.since_grid = Some(Stopwatch::start());
         tracing::debug!(
@@ -111,7 +110,7 @@ impl GridStage {
             ground.height,
             100.0 * ground.share
         );
-        self.stream.report("", self.volume.bytes());
+        self.stream.report("");
         let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
             self.volume.level_from_map() * keyframe.map_from_camera.translation
         });
@@ -130,36 +129,31 @@ impl GridStage {
             level_from_map: self.volume.level_from_map(),
         };
         if let Err(e) = self.stream.publish(&self.publisher, level_grid) {
-            self.warn(&format!("a grid did not go out: {e}"));
+            self.rate_limited
+                .warn(format_args!("a grid did not go out: {e}"));
         }
     }
 
     fn warn_of(&mut self, faults: &[VolumeError]) {
         if let Some(first) = faults.first() {
-            self.warn(&format!("{first} ({} in all)", faults.len()));
-        }
-    }
-
-    /// At most once per `LOG_SECS`.
-    fn warn(&mut self, text: &str) {
-        if self
-            .since_warning
-            .is_none_or(|watch| watch.secs() > LOG_SECS)
-        {
-            tracing::warn!("{text}");
-            self.since_warning = Some(Stopwatch::start());
+            let text = format_args!("{first} ({} in all)", faults.len());
+            self.rate_limited.warn(text);
         }
     }
 }
 
-fn keyframes_of(input: &GridInput, map_from_world: &Similarity) -> Vec<KeyframeDepth> {
+/// `map_from_world` has metres a unit for its scale.
+pub(crate) fn keyframes_of<'a>(
+    views: impl IntoIterator<Item = &'a KeyframeView>,
+    map_from_world: &Similarity,
+) -> Vec<KeyframeDepth> {
     let keyframe = |view: &KeyframeView| KeyframeDepth {
         id: view.keyframe.id,
         map_from_camera: *map_from_world * Similarity::from(view.world_from_cam),
         intrinsics: view.intrinsics,
         depth: Arc::clone(&view.depth),
     };
-    input.keyframes.iter().map(keyframe).collect()
+    views.into_iter().map(keyframe).collect()
 }
 
 /// Runs until the map has ended.

@@ -14,6 +14,8 @@ pub mod page_file;
 
 pub mod save_map;
 
+mod rate_limited;
+
 mod grid_thread;
 
 mod publish_threads;

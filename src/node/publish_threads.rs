@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use crate::machine::memory::rss_mib;
 use crate::node::grid_thread::{GridInput, GridStage};
+use crate::node::rate_limited::RateLimitedLog;
 use splat_io::queue::{Received, Receiver};
 use splat_ros::error::PublishError;
 use splat_ros::map_stream::MapStream;
@@ -21,8 +22,6 @@ use splat_volume::params::GridParams;
 /// Transforms go out at least so often: consumers like to look back no further (Nav2: 10 Hz, better 20).
 const REPEAT: Duration = Duration::from_millis(30);
 const STATUS_SECS: f64 = 1.0;
-/// Seconds between warnings of one kind.
-const LOG_SECS: f64 = 10.0;
 
 /// Events of the tracker, to be published.
 #[derive(Debug)]
@@ -43,20 +42,10 @@ pub(crate) struct Outgoing {
 /// What goes out, and whether it is the last.
 pub(crate) type SnapshotEvent = (Outgoing, bool);
 
-/// Logs failures to send, at most once per `LOG_SECS`.
-#[derive(Debug, Default)]
-struct RateLimitedLog {
-    since: Option<Stopwatch>,
-}
-
-impl RateLimitedLog {
-    fn of(&mut self, sent: Result<(), PublishError>) {
-        let Err(e) = sent else { return };
-        // A client that is gone or slow must not end the run.
-        if self.since.is_none_or(|watch| watch.secs() > LOG_SECS) {
-            tracing::warn!("a message did not go out: {e}");
-            self.since = Some(Stopwatch::start());
-        }
+/// A client that is gone or slow must not end the run.
+fn warn_of(log: &mut RateLimitedLog, sent: Result<(), PublishError>) {
+    if let Err(e) = sent {
+        log.warn(format_args!("a message did not go out: {e}"));
     }
 }
 
@@ -83,17 +72,17 @@ impl LiveStage {
             }
             LiveEvent::Keyframe(seen) => self.poses.keyframe(&self.publisher, seen),
         };
-        self.rate_limited.of(sent);
+        warn_of(&mut self.rate_limited, sent);
     }
 
     fn repeat_transforms(&mut self) {
         let sent = self.poses.repeat_transforms(&self.publisher);
-        self.rate_limited.of(sent);
+        warn_of(&mut self.rate_limited, sent);
     }
 
     fn send_status(&mut self) {
         let sent = self.status.send(&self.publisher, rss_mib());
-        self.rate_limited.of(sent);
+        warn_of(&mut self.rate_limited, sent);
     }
 }
 
@@ -111,7 +100,7 @@ impl SnapshotStage {
         let map = &mut self.map;
         let sent = map.publish(&self.publisher, &outgoing.snapshot, *is_last, n_queued);
         let submaps = map.publish_submaps(&self.publisher, &outgoing.submaps);
-        self.rate_limited.of(sent.and(submaps));
+        warn_of(&mut self.rate_limited, sent.and(submaps));
     }
 }
 

@@ -1,14 +1,11 @@
 //! The outcome of a run -> its map from above, for the report.
 
-use std::sync::Arc;
-
 use crate::formats::planner_map;
+use crate::node::grid_thread::keyframes_of;
 use crate::node::job::Outcome;
 use crate::report::top_view::TopView;
 use splat_slam::track::landmarks::KeyframeView;
-use splat_types::transform::Similarity;
 use splat_volume::params::GridParams;
-use splat_volume::volume::KeyframeDepth;
 
 /// Keyframes that are fused, five milliseconds each; of a run that was stopped, whose files are waited for.
 const MAX_VIEWS: usize = 400;
@@ -38,13 +35,7 @@ pub(crate) fn top_view(outcome: &mut Outcome, params: &GridParams) -> Option<Top
     let first = views.first()?.world_from_cam;
     let scale = metres.or_else(guess)?;
     let map_from_world = planner_map::map_from_world(first, Some(scale));
-    let keyframe = |view: &KeyframeView| KeyframeDepth {
-        id: view.keyframe.id,
-        map_from_camera: map_from_world * Similarity::from(view.world_from_cam),
-        intrinsics: view.intrinsics,
-        depth: Arc::clone(&view.depth),
-    };
-    let keyframes: Vec<KeyframeDepth> = views.iter().step_by(every).map(keyframe).collect();
+    let keyframes = keyframes_of(views.iter().step_by(every), &map_from_world);
     let mut volume = planner_map::fused(&keyframes, params);
     let level = volume.level_from_map();
     let place = |view: &KeyframeView| {

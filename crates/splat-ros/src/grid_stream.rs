@@ -93,11 +93,10 @@ impl GridStream {
     }
 
     /// Why there is no grid; empty while there is one, or none is wanted.
-    pub fn report(&self, refused: &str, bytes: usize) {
-        self.reports.grid.update(|status| {
-            refused.clone_into(&mut status.refused);
-            status.bytes = bytes;
-        });
+    pub fn report(&self, refused: &str) {
+        self.reports
+            .grid
+            .update(|status| refused.clone_into(&mut status.refused));
     }
 
     /// Services answer from it until the next one.

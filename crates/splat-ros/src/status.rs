@@ -129,8 +129,6 @@ pub struct PublishedStatus {
 pub struct GridStatus {
     /// Why there is none; empty: there is one, or none is wanted.
     pub refused: String,
-    /// Of the volume and of the depth that it is made of.
-    pub bytes: usize,
 }
 
 /// What all stages say at one moment.

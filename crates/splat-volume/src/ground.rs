@@ -47,8 +47,7 @@ impl GroundPlane {
                 continue;
             }
             let height = normal.dot(a);
-            let is_on = |p: &&DVec3| (normal.dot(**p) - height).abs() <= INLIER;
-            let on = points.iter().filter(is_on).count();
+            let on = on_plane(points, (normal, height)).count();
             if best.is_none_or(|(most, ..)| on > most) {
                 best = Some((on, normal, height));
             }
@@ -58,10 +57,7 @@ impl GroundPlane {
         let (normal, _) = (0..3).fold((normal, height), |plane, _| refit(points, plane));
         let height = lowest(points, normal)?;
         let (normal, height) = (0..3).fold((normal, height), |plane, _| refit(points, plane));
-        let n_on = points
-            .iter()
-            .filter(|p| (normal.dot(**p) - height).abs() <= INLIER)
-            .count();
+        let n_on = on_plane(points, (normal, height)).count();
         let share = n_on as f64 / points.len() as f64;
         (share >= MIN_SHARE && normal.is_finite()).then_some(Self {
             normal,
@@ -105,12 +101,16 @@ fn lowest(points: &[DVec3], normal: DVec3) -> Option<f64> {
     (below <= MAX_SHARE_BELOW * n).then_some(first)
 }
 
+/// Points that lie on the plane normal . point = height.
+fn on_plane(points: &[DVec3], (normal, height): (DVec3, f64)) -> impl Iterator<Item = &DVec3> {
+    let is_on = move |p: &&DVec3| (normal.dot(**p) - height).abs() <= INLIER;
+    points.iter().filter(is_on)
+}
+
 /// Least squares over the points that lie on it, heights along the old normal.
 fn refit(points: &[DVec3], (normal, height): (DVec3, f64)) -> (DVec3, f64) {
     let (u, v) = normal.any_orthonormal_pair();
-    let on: Vec<DVec3> = points
-        .iter()
-        .filter(|p| (normal.dot(**p) - height).abs() <= INLIER)
+    let on: Vec<DVec3> = on_plane(points, (normal, height))
         .map(|p| DVec3::new(u.dot(*p), v.dot(*p), normal.dot(*p) - height))
         .collect();
     if on.len() < 3 {
@@ -134,8 +134,8 @@ fn refit(points: &[DVec3], (normal, height): (DVec3, f64)) -> (DVec3, f64) {
     let slope_x = (xz * yy - yz * xy) / determinant;
     let slope_y = (yz * xx - xz * xy) / determinant;
     let turned = (normal - u * slope_x - v * slope_y).normalize();
-    let on_plane = u * middle.x + v * middle.y + normal * (middle.z + height);
-    (turned, turned.dot(on_plane))
+    let place = u * middle.x + v * middle.y + normal * (middle.z + height);
+    (turned, turned.dot(place))
 }
 
 #[cfg(test)]

@@ -51,7 +51,7 @@ pub enum State {
     Inside,
 }
 
-/// A surface's voxels: the middle of one in three is so near.
+/// Voxels: a plane across an axis always has a middle within half a voxel; more closes the gaps of slanted ones.
 const SURFACE_SHARE: f32 = 0.6;
 
 /// Block by block; voxel (x, y, z) of the whole has its middle at (x + 0.5, y + 0.5, z + 0.5) times `size`.
