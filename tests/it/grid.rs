@@ -17,8 +17,7 @@ use splat_synth::settings::{SceneKind, SynthSettings};
 use splat_synth::take::Take;
 use splat_types::depth::DepthMap;
 use splat_types::frame::Frame;
-use splat_types::image::RgbImage;
-use splat_types::snapshot::Scale;
+use splat_types::snapshot::{KeyframePose, Scale};
 use splat_volume::grid::{FREE, Grid, OCCUPIED, UNKNOWN};
 use splat_volume::params::GridParams;
 
@@ -34,23 +33,21 @@ fn take() -> Take {
     Take::new(settings).unwrap()
 }
 
-fn replayed(geometry: &str, out: &Path, sent: &Path, more: &[&str]) {
-    let record = format!("publish.record={}", sent.display());
-    let mut args = vec![
-        "replay",
-        SCENE,
-        "--geometry",
-        geometry,
-        "--backend",
-        "cpu",
-        "--steps",
-        "10",
-    ];
-    args.extend(["--out", out.to_str().unwrap(), "--set", &record]);
-    args.extend(more.iter().flat_map(|set| ["--set", set]));
+fn replayed(input: &str, geometry: &str, out: &Path, more: &[&str]) {
+    let mut args = vec!["replay", input, "--geometry", geometry, "--backend", "cpu"];
+    args.extend(["--out", out.to_str().unwrap()]);
+    args.extend(more);
     let output = run(&args);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{said}");
+}
+
+/// The same of the room, with all that goes out recorded.
+fn recorded(geometry: &str, out: &Path, sent: &Path, sets: &[&str]) {
+    let record = format!("publish.record={}", sent.display());
+    let mut more = vec!["--steps", "10", "--set", &record];
+    more.extend(sets.iter().flat_map(|set| ["--set", set]));
+    replayed(SCENE, geometry, out, &more);
 }
 
 /// Each message of a topic.
@@ -89,7 +86,7 @@ fn what_goes_out_is_what_nav2_takes() {
     let folder = tempfile::tempdir().unwrap();
     let sent = folder.path().join("sent.mcap");
     let every = ["map.snapshot_secs=0.2", "grid.period=0.05"];
-    replayed("ground_truth", &folder.path().join("out"), &sent, &every);
+    recorded("ground_truth", &folder.path().join("out"), &sent, &every);
     let grids = messages(&sent, "grid");
     let grids: Vec<OccupancyGrid> = grids.iter().map(|m| ros::decode(m).unwrap()).collect();
     assert!(!grids.is_empty());
@@ -127,7 +124,7 @@ fn without_a_scale_there_is_no_grid_and_the_status_says_why() {
     let folder = tempfile::tempdir().unwrap();
     let sent = folder.path().join("sent.mcap");
     let out = folder.path().join("out");
-    replayed("sfm", &out, &sent, &["scale.source=off"]);
+    recorded("sfm", &out, &sent, &["scale.source=off"]);
     assert!(messages(&sent, "grid").is_empty() && messages(&sent, "distance_slice").is_empty());
     let status = messages(&sent, "status").pop().unwrap();
     let text = String::from_utf8_lossy(&status);
@@ -141,51 +138,57 @@ fn without_a_scale_there_is_no_grid_and_the_status_says_why() {
     assert!(!yaml.exists());
 }
 
-/// The same keyframes with depth that is exact.
-fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
+/// The same keyframes with other depth, units of the map.
+fn with_depth(map: &Checkpoint, depth_of: impl Fn(&KeyframePose) -> DepthMap) -> Checkpoint {
     let mut map = map.clone();
-    let views = map.views.iter_mut();
-    for view in views {
-        let poses = map.snapshot.poses.iter();
-        let pose = poses.clone().find(|p| p.keyframe_id == view.keyframe_id);
-        let pose = pose.unwrap();
-        let frame = (0..take.settings().n_frames)
-            .find(|ix| take.stamp(*ix) == pose.stamp)
-            .unwrap();
+    for view in &mut map.views {
+        let mut poses = map.snapshot.poses.iter();
+        let pose = poses.find(|p| p.keyframe_id == view.keyframe_id).unwrap();
         let k = pose.intrinsics;
-        let n = (k.width_px * k.height_px * 3) as usize;
+        let (image, _) = view.unpacked((k.width_px, k.height_px)).unwrap();
         view.content = Content::InMemory {
-            image: Arc::new(RgbImage {
-                width_px: k.width_px,
-                height_px: k.height_px,
-                pixels: vec![0; n],
-            }),
-            depth: Arc::new(take.depth(frame, &k)),
+            image: Arc::new(image),
+            depth: Arc::new(depth_of(pose)),
         };
     }
     map
 }
 
-/// The same keyframes with the depth of a depth camera, where a frame has one.
+fn frame_of(take: &Take, pose: &KeyframePose) -> u32 {
+    let mut frames = 0..take.settings().n_frames;
+    frames.find(|ix| take.stamp(*ix) == pose.stamp).unwrap()
+}
+
+/// In metres.
+fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
+    with_depth(map, |pose| {
+        take.depth(frame_of(take, pose), &pose.intrinsics)
+    })
+}
+
+/// Of a depth camera, where a frame has it.
 fn measured(map: &Checkpoint, frames: &[Frame]) -> Checkpoint {
     let unit = map.snapshot.scale.metres_per_unit.unwrap();
-    let mut map = map.clone();
-    for view in &mut map.views {
-        let poses = map.snapshot.poses.iter();
-        let pose = poses.clone().find(|p| p.keyframe_id == view.keyframe_id);
-        let pose = pose.unwrap();
-        let k = pose.intrinsics;
-        let (image, _) = view.unpacked((k.width_px, k.height_px)).unwrap();
+    with_depth(map, |pose| {
         let frame = frames.iter().find(|frame| frame.stamp == pose.stamp);
         let depth = frame.and_then(|frame| frame.sensor_depth.as_deref().cloned());
         let mut depth = depth.unwrap_or_else(DepthMap::none);
         depth.scale(1.0 / unit);
-        view.content = Content::InMemory {
-            image: Arc::new(image),
-            depth: Arc::new(depth),
-        };
-    }
-    map
+        depth
+    })
+}
+
+fn grid_of(map: &Checkpoint) -> Grid {
+    let mut volume = planner_map::volume(map, &GridParams::default()).unwrap();
+    planner_map::grid_of(&mut volume).unwrap()
+}
+
+/// Of both grids where both decide.
+fn decided<'a>(a: &'a Grid, b: &'a Grid) -> impl Iterator<Item = (IVec2, i8, i8)> + 'a {
+    let (first, width) = (a.extent.first, a.extent.width);
+    let cells = (0..a.cells.len() as i32).map(move |at| first + IVec2::new(at % width, at / width));
+    let both = cells.map(|cell| (cell, a.cell(cell), b.cell(cell)));
+    both.filter(|(_, a, b)| *a != UNKNOWN && *b != UNKNOWN)
 }
 
 #[test]
@@ -196,41 +199,18 @@ fn a_kitchen_from_stereo_is_that_of_a_depth_camera() {
     let bag = scene.join("rosbag2");
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
-    let (input, to) = (bag.to_str().unwrap(), out.to_str().unwrap());
-    let output = run(&[
-        "replay",
-        input,
-        "--out",
-        to,
-        "--backend",
-        "cpu",
-        "--max-side",
-        "320",
-        "--steps",
-        "1",
-    ]);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{said}");
+    let input = bag.to_str().unwrap();
+    replayed(input, "sfm", &out, &["--max-side", "320", "--steps", "1"]);
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
     let source = Settings::shipped().params().unwrap().source;
     let mut source = open(input, &source, 0).unwrap();
     let frames: Vec<Frame> = std::iter::from_fn(|| source.next()).collect();
-    let grid_of = |map: &Checkpoint| {
-        let mut volume = planner_map::volume(map, &GridParams::default()).unwrap();
-        planner_map::grid_of(&mut volume).unwrap()
-    };
     let (stereo, sensor) = (grid_of(&map), grid_of(&measured(&map, &frames)));
-    let [mut n_decided, mut n_agree] = [0, 0];
-    for at in 0..stereo.cells.len() {
-        let width = stereo.extent.width as usize;
-        let cell = stereo.extent.first + IVec2::new((at % width) as i32, (at / width) as i32);
-        let (found, other) = (stereo.cell(cell), sensor.cell(cell));
-        if found != UNKNOWN && other != UNKNOWN {
-            n_decided += 1;
-            n_agree += i32::from(is_near(&sensor, cell, found));
-        }
-    }
-    let is_alike = f64::from(n_agree) >= 0.95 * f64::from(n_decided);
+    let n_decided = decided(&stereo, &sensor).count();
+    let agree =
+        decided(&stereo, &sensor).filter(|(cell, found, _)| is_near(&sensor, *cell, *found));
+    let n_agree = agree.count();
+    let is_alike = n_agree as f64 >= 0.95 * n_decided as f64;
     assert!(n_decided > 1000 && is_alike, "{n_agree} of {n_decided}");
 }
 
@@ -243,11 +223,11 @@ fn is_near(grid: &Grid, cell: IVec2, value: i8) -> bool {
 fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
     let folder = tempfile::tempdir().unwrap();
     let (out, sent) = (folder.path().join("out"), folder.path().join("sent.mcap"));
-    replayed("ground_truth", &out, &sent, &["grid.enabled=false"]);
+    recorded("ground_truth", &out, &sent, &["grid.enabled=false"]);
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
-    let params = GridParams::default();
-    let grid_of = |map: &Checkpoint| {
-        let mut volume = planner_map::volume(map, &params).unwrap();
+    let truth = exact(&map, &take());
+    for map in [&map, &truth] {
+        let volume = planner_map::volume(map, &GridParams::default()).unwrap();
         let ground = volume.ground().unwrap();
         // The first camera's height above the floor.
         let height = take().pose(0).translation.z;
@@ -255,22 +235,15 @@ fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
             (ground.height + height).abs() < 0.02,
             "{ground:?}, {height}"
         );
-        planner_map::grid_of(&mut volume).unwrap()
-    };
-    let (stereo, wanted) = (grid_of(&map), grid_of(&exact(&map, &take())));
+    }
+    let (stereo, wanted) = (grid_of(&map), grid_of(&truth));
     let [mut n_decided, mut n_agree, mut n_free, mut n_wrong] = [0; 4];
-    for y in 0..wanted.extent.height {
-        for x in 0..wanted.extent.width {
-            let cell = wanted.extent.first + IVec2::new(x, y);
-            let (found, truth) = (stereo.cell(cell), wanted.cell(cell));
-            if found != UNKNOWN && truth != UNKNOWN {
-                n_decided += 1;
-                n_agree += i32::from(is_near(&wanted, cell, found));
-            }
-            if found == FREE && truth != UNKNOWN {
-                n_free += 1;
-                n_wrong += i32::from(!is_near(&wanted, cell, FREE));
-            }
+    for (cell, found, _) in decided(&stereo, &wanted) {
+        n_decided += 1;
+        n_agree += i32::from(is_near(&wanted, cell, found));
+        if found == FREE {
+            n_free += 1;
+            n_wrong += i32::from(!is_near(&wanted, cell, FREE));
         }
     }
     assert!(n_decided > 5000 && n_free > 4000);
@@ -290,20 +263,7 @@ fn after_a_loop_there_is_one_wall_and_it_is_where_it_was() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
     let scene = "synthetic:corridor?frames=220&width=320&height=240";
-    let output = run(&[
-        "replay",
-        scene,
-        "--geometry",
-        "sfm",
-        "--backend",
-        "cpu",
-        "--steps",
-        "1",
-        "--out",
-        out.to_str().unwrap(),
-    ]);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{said}");
+    replayed(scene, "sfm", &out, &["--steps", "1"]);
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
     let settings = SynthSettings {
         n_frames: 220,
@@ -314,24 +274,15 @@ fn after_a_loop_there_is_one_wall_and_it_is_where_it_was() {
     let take = Take::new(settings).unwrap();
     let mut truth = exact(&map, &take);
     for pose in &mut truth.snapshot.poses {
-        let frame = (0..220).find(|ix| take.stamp(*ix) == pose.stamp).unwrap();
-        pose.world_from_cam = take.pose(frame);
+        pose.world_from_cam = take.pose(frame_of(&take, pose));
     }
     truth.snapshot.scale = Scale::GIVEN;
-    let params = GridParams::default();
-    let grid_of = |map: &Checkpoint| {
-        let mut volume = planner_map::volume(map, &params).unwrap();
-        planner_map::grid_of(&mut volume).unwrap()
-    };
     let (found, wanted) = (grid_of(&map), grid_of(&truth));
     // Both begin at the first keyframe; what is left is the scale's error and the poses'. A cell counts as met by one beside it.
     let count = |a: &Grid, b: &Grid| {
-        let cells = (0..a.cells.len()).map(|at| {
-            let width = a.extent.width as usize;
-            a.extent.first + IVec2::new((at % width) as i32, (at / width) as i32)
-        });
-        let occupied: Vec<IVec2> = cells
-            .filter(|cell| a.cell(*cell) == OCCUPIED && b.cell(*cell) != UNKNOWN)
+        let occupied: Vec<IVec2> = decided(a, b)
+            .filter(|(_, own, _)| *own == OCCUPIED)
+            .map(|(cell, ..)| cell)
             .collect();
         let met = occupied.iter().filter(|cell| is_near(b, **cell, OCCUPIED));
         (met.count(), occupied.len())
