@@ -16,6 +16,8 @@ pub mod ground;
 
 pub mod columns;
 
+pub mod ellipsoids;
+
 pub mod volume;
 
 pub mod grid;
@@ -27,3 +29,5 @@ pub mod field;
 pub mod map_file;
 
 pub mod mesh;
+
+pub mod mesh_colour;

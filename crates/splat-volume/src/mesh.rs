@@ -46,10 +46,28 @@ const EDGES: [(usize, usize); 12] = [
 
 /// The surface of all voxels that know their distance.
 pub fn mesh(voxels: &Voxels) -> Mesh {
+    mesh_of(voxels, &voxels.indices())
+}
+
+/// The surface in the blocks that a box touches.
+pub fn mesh_in(voxels: &Voxels, low: DVec3, high: DVec3) -> Mesh {
+    let edge = voxels.size * f64::from(SIDE);
+    // A surface between two blocks belongs to the lower one.
+    let low = (low / edge).floor() - 1.0;
+    let high = (high / edge).floor();
+    let is_touched = |block: &IVec3| {
+        let block = block.as_dvec3();
+        block.cmpge(low).all() && block.cmple(high).all()
+    };
+    let mut indices = voxels.indices();
+    indices.retain(is_touched);
+    mesh_of(voxels, &indices)
+}
+
+fn mesh_of(voxels: &Voxels, indices: &[IVec3]) -> Mesh {
     let mut mesh = Mesh::default();
     let mut vertex_of: HashMap<IVec3, u32> = HashMap::new();
-    let indices = voxels.indices();
-    for block in &indices {
+    for block in indices {
         for at in cells_of(*block) {
             if let Some(vertex) = vertex(voxels, at) {
                 vertex_of.insert(at, mesh.vertices.len() as u32);
@@ -57,7 +75,7 @@ pub fn mesh(voxels: &Voxels) -> Mesh {
             }
         }
     }
-    for block in &indices {
+    for block in indices {
         for at in cells_of(*block) {
             add_faces(voxels, at, &vertex_of, &mut mesh.triangles);
         }
@@ -122,16 +140,19 @@ fn add_faces(
 }
 
 impl Mesh {
-    /// A binary PLY.
-    pub fn ply(&self) -> Vec<u8> {
+    /// A binary PLY; `colours` per vertex, sRGB.
+    pub fn ply(&self, colours: &[[u8; 3]]) -> Vec<u8> {
         let header = format!(
-            "ply\nformat binary_little_endian 1.0\ncomment metres, z up\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar uint vertex_indices\nend_header\n",
+            "ply\nformat binary_little_endian 1.0\ncomment metres, z up\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nelement face {}\nproperty list uchar uint vertex_indices\nend_header\n",
             self.vertices.len(),
             self.triangles.len()
         );
         let mut bytes = header.into_bytes();
-        for value in self.vertices.iter().flatten() {
-            bytes.extend_from_slice(&value.to_le_bytes());
+        for (vertex, colour) in self.vertices.iter().zip(colours) {
+            for value in vertex {
+                bytes.extend_from_slice(&value.to_le_bytes());
+            }
+            bytes.extend_from_slice(colour);
         }
         for triangle in &self.triangles {
             bytes.push(3);

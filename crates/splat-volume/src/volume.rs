@@ -6,6 +6,7 @@ use std::sync::{Arc, Weak};
 use glam::{DQuat, DVec3, IVec2};
 
 use crate::columns::Columns;
+use crate::ellipsoids::FusedKeyframe;
 use crate::error::VolumeError;
 use crate::ground::GroundPlane;
 use crate::params::GridParams;
@@ -45,7 +46,7 @@ struct Fused {
     /// What it was made of; another one is fused anew. It does not keep the pixels.
     source: Weak<DepthMap>,
     width_px: u32,
-    view: DepthView,
+    view: Arc<DepthView>,
     /// As it was put in; `None`: not yet.
     level_from_cam: Option<Similarity>,
     /// Where it belongs.
@@ -119,6 +120,20 @@ impl Volume {
         self.keyframes.len()
     }
 
+    /// Those that are in the volume and still have their depth, as they were put in.
+    pub fn fused(&self) -> Vec<FusedKeyframe> {
+        let keyframes = self.keyframes.iter();
+        keyframes
+            .filter_map(|(id, fused)| {
+                Some(FusedKeyframe {
+                    id: *id,
+                    level_from_cam: fused.level_from_cam?,
+                    view: Arc::clone(&fused.view),
+                })
+            })
+            .collect()
+    }
+
     /// Where keyframes belong from now on; those that are not among them go. Faulty ones stay out and are returned.
     pub fn set_keyframes(&mut self, keyframes: &[KeyframeDepth]) -> Vec<VolumeError> {
         let mut faults = Vec::new();
@@ -169,7 +184,7 @@ impl Volume {
             }
             _ => {
                 self.take_out(keyframe.id);
-                let view = DepthView::new(&keyframe.depth, k);
+                let view = Arc::new(DepthView::new(&keyframe.depth, k));
                 let fused = Fused {
                     source,
                     width_px,
