@@ -300,7 +300,7 @@ struct RenderArgs {
 struct ExportArgs {
     /// map.splatmap, or a .ply or .spz of any program
     map: PathBuf,
-    /// OUT.ply, .compressed.ply, .spz, .glb or .splat; .yaml for map_server, .mesh.ply or .npy for planners; or DIR/ for a scene of
+    /// OUT.ply, .compressed.ply, .spz, .glb or .splat; .yaml for map_server, .mesh.ply, .mesh.glb or .npy for planners; or DIR/ for a scene of
     /// images and poses
     out: PathBuf,
     /// Of a scene: colmap or nerfstudio

@@ -186,7 +186,7 @@ fn export_for_planners(args: &ExportArgs, file: PlannerFile) -> anyhow::Result<E
     let params = mapping::settings(&args.params)?.params()?.grid;
     let map = checkpoint::read(&args.map)?;
     let mut volume = planner_map::volume(&map, &params)?;
-    let found = file.write(&mut volume, &args.out)?;
+    let found = file.write(&map, &mut volume, &args.out)?;
     say(format!("{found}: {}", args.out.display()));
     Ok(ExitCode::SUCCESS)
 }

@@ -23,7 +23,8 @@ pub enum SplatFormat {
 }
 
 /// Endings of names that are known, for messages.
-pub const ENDINGS: &str = ".ply, .compressed.ply, .spz, .glb, .splat, .yaml, .mesh.ply or .npy";
+pub const ENDINGS: &str =
+    ".ply, .compressed.ply, .spz, .glb, .splat, .yaml, .mesh.ply, .mesh.glb or .npy";
 
 impl SplatFormat {
     /// By the ending of its name. `spz`: the version that an .spz gets.

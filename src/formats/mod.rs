@@ -10,6 +10,8 @@ pub mod dot_splat;
 
 pub mod glb;
 
+pub mod mesh_glb;
+
 pub mod spz;
 
 pub mod file;

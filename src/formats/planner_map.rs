@@ -1,7 +1,7 @@
 //! A map with the depth of its keyframes -> what planners load: the two files of map_server, a mesh, a volume of distances.
 //!
-//! The frame is the robot's map frame of a run without odometry or a mount: it begins at the first keyframe, which looks along x, and is turned so that
-//! the ground is level. Metres.
+//! The frame is the robot's map frame, as it was saved with the map, turned so that the ground is level: what the run published, and what a run that goes
+//! on from the map publishes. A map that was made without anything published begins at its first keyframe, which looks along x. Metres.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -11,14 +11,16 @@ use std::sync::Arc;
 use glam::{IVec2, IVec3};
 use serde_json::json;
 
+use crate::formats::mesh_glb;
 use splat_io::whole_file::write_file;
-use splat_ros::odometry::{FrameTree, forward_camera};
+use splat_ros::odometry::saved_map_frame;
 use splat_slam::mapper::map_file::checkpoint::Checkpoint;
 use splat_types::snapshot::KeyframePose;
-use splat_types::transform::{Rigid, Similarity};
+use splat_types::transform::Similarity;
 use splat_volume::grid::{FREE, Grid, OCCUPIED, grid};
 use splat_volume::map_file;
-use splat_volume::mesh::mesh;
+use splat_volume::mesh::{Mesh, mesh};
+use splat_volume::mesh_colour::colours;
 use splat_volume::params::GridParams;
 use splat_volume::volume::{KeyframeDepth, Volume};
 use splat_volume::voxels::SIDE;
@@ -32,7 +34,9 @@ pub enum PlannerFile {
     /// `.yaml` for map_server, and a `.pgm` beside it.
     Grid,
     /// `.mesh.ply`
-    Mesh,
+    MeshPly,
+    /// `.mesh.glb`
+    MeshGlb,
     /// `.npy`, and a `.json` beside it that says where it lies.
     Distances,
 }
@@ -68,7 +72,8 @@ impl PlannerFile {
         let name = path.file_name()?.to_str()?.to_ascii_lowercase();
         let known = [
             (".yaml", Self::Grid),
-            (".mesh.ply", Self::Mesh),
+            (".mesh.ply", Self::MeshPly),
+            (".mesh.glb", Self::MeshGlb),
             (".npy", Self::Distances),
         ];
         let is_named = |ending: &str| name.len() > ending.len() && name.ends_with(ending);
@@ -76,8 +81,13 @@ impl PlannerFile {
         found.map(|(_, file)| file)
     }
 
-    /// Writes the file -> what it holds.
-    pub fn write(self, volume: &mut Volume, out: &Path) -> Result<String, PlannerError> {
+    /// Writes the file -> what it holds. `volume`: of the map.
+    pub fn write(
+        self,
+        map: &Checkpoint,
+        volume: &mut Volume,
+        out: &Path,
+    ) -> Result<String, PlannerError> {
         match self {
             Self::Grid => {
                 let grid = grid_of(volume)?;
@@ -93,9 +103,16 @@ impl PlannerFile {
                     grid.resolution
                 ))
             }
-            Self::Mesh => {
-                let mesh = mesh(volume.voxels());
-                save(out, &mesh.ply())?;
+            Self::MeshPly => {
+                let (mesh, colours) = coloured_mesh(map, volume);
+                save(out, &mesh.ply(&colours))?;
+                Ok(format!("{} triangles", mesh.triangles.len()))
+            }
+            Self::MeshGlb => {
+                let (mesh, colours) = coloured_mesh(map, volume);
+                let name = out.file_name().unwrap_or_default().to_string_lossy();
+                let write = |file: &mut dyn Write| mesh_glb::write(&mesh, &colours, &name, file);
+                write_file(out, |file| write(file)).map_err(fault(out))?;
                 Ok(format!("{} triangles", mesh.triangles.len()))
             }
             Self::Distances => distances(volume, out),
@@ -111,8 +128,7 @@ pub fn volume(map: &Checkpoint, params: &GridParams) -> Result<Volume, PlannerEr
     }
     let poses = map.snapshot.poses.iter();
     let poses: BTreeMap<u32, &KeyframePose> = poses.map(|pose| (pose.keyframe_id, pose)).collect();
-    let first = poses.first_key_value().map(|(_, pose)| pose.world_from_cam);
-    let map_from_world = map_from_world(first.unwrap_or(Rigid::IDENTITY), metres);
+    let map_from_world = map_from_world_of(map);
     let mut keyframes = Vec::new();
     for view in &map.views {
         let Some(pose) = poses.get(&view.keyframe_id) else {
@@ -138,12 +154,19 @@ pub fn volume(map: &Checkpoint, params: &GridParams) -> Result<Volume, PlannerEr
     Ok(volume)
 }
 
-/// The map frame of a run without odometry or a mount: it begins at the first keyframe, which looks along x.
-pub fn map_from_world(first_world_from_cam: Rigid, metres_per_unit: Option<f64>) -> Similarity {
-    let mut frames = FrameTree::default();
-    frames.metres_per_unit = metres_per_unit;
-    frames.anchor(first_world_from_cam, forward_camera());
-    frames.map_from_world()
+/// The mesh of all that was fused, and a colour for each vertex.
+fn coloured_mesh(map: &Checkpoint, volume: &Volume) -> (Mesh, Vec<[u8; 3]>) {
+    let voxels = volume.voxels();
+    let level_from_world = volume.in_level(&map_from_world_of(map));
+    let mesh = mesh(voxels);
+    let colours = colours(&mesh, voxels.size, &map.snapshot.splats, &level_from_world);
+    (mesh, colours)
+}
+
+fn map_from_world_of(map: &Checkpoint) -> Similarity {
+    let frame = saved_map_frame(map.map_frame, &map.snapshot.poses);
+    let metres = map.snapshot.scale.metres_per_unit;
+    frame.map_from_world(metres.unwrap_or(1.0))
 }
 
 /// What cannot be fused is left out, with a warning.
@@ -181,7 +204,7 @@ fn distances(volume: &Volume, out: &Path) -> Result<String, PlannerError> {
         "voxel_m": voxels.size,
         "truncation_m": voxels.truncation,
         "lower_corner_m": origin,
-        "frame": "the map frame, turned level: x ahead of the first keyframe, z up",
+        "frame": "the robot's map frame, turned level: z up",
     });
     save(&beside, format!("{place:#}\n").as_bytes())?;
     let fill = |file: &mut dyn Write| -> io::Result<()> {

@@ -19,6 +19,11 @@ use splat_volume::volume::{KeyframeDepth, Volume};
 
 /// Keyframes that are fused between looks at whether there are newer ones.
 const KEYFRAMES_AT_ONCE: usize = 8;
+/// Ellipsoids and voxels go out every so many seconds, and seldomer where they take more than this share of the time.
+const OBSTACLES_SECS: f64 = 2.0;
+const OBSTACLES_SHARE: f64 = 0.05;
+/// They lie within so many times the range of depth of the newest keyframe.
+const OBSTACLES_REACH: f64 = 2.0;
 
 /// All keyframes as a snapshot has them.
 #[derive(Debug, Clone)]
@@ -37,6 +42,9 @@ pub(crate) struct GridStage {
     stream: GridStream,
     pool: Option<rayon::ThreadPool>,
     since_grid: Option<Stopwatch>,
+    since_obstacles: Option<Stopwatch>,
+    /// Least time between two messages of obstacles, seconds.
+    obstacles_period: f64,
     rate_limited: RateLimitedLog,
 }
 
@@ -50,6 +58,8 @@ impl GridStage {
             stream,
             pool: None,
             since_grid: None,
+            since_obstacles: None,
+            obstacles_period: OBSTACLES_SECS,
             rate_limited: RateLimitedLog::default(),
         }
     }
@@ -95,9 +105,12 @@ impl GridStage {
 
     fn send(&mut self, input: &GridInput, keyframes: &[KeyframeDepth]) {
         let snapshot = &input.snapshot;
-        let (voxels, level) = (self.volume.voxels().clone(), self.volume.level_from_map());
-        let at = (snapshot.epoch, snapshot.revision);
-        self.stream.keep_volume(&self.publisher, voxels, level, at);
+        self.stream
+            .keep_volume(&self.publisher, &self.volume, snapshot);
+        let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
+            self.volume.level_from_map() * keyframe.map_from_camera.translation
+        });
+        self.send_obstacles(input, newest);
         let Some(ground) = self.volume.ground() else {
             let reason = "no ground was seen: a plane below the camera that leans by less than 25 degrees from level";
             return self.stream.report(reason);
@@ -111,9 +124,6 @@ impl GridStage {
             100.0 * ground.share
         );
         self.stream.report("");
-        let newest = keyframes.last().map_or(DVec3::ZERO, |keyframe| {
-            self.volume.level_from_map() * keyframe.map_from_camera.translation
-        });
         let resolution = self.params.resolution;
         let focus = (newest / resolution).floor().truncate().as_ivec2();
         let before = self.stream.extent();
@@ -132,6 +142,31 @@ impl GridStage {
             self.rate_limited
                 .warn(format_args!("a grid did not go out: {e}"));
         }
+    }
+
+    /// What lies around the newest keyframe.
+    fn send_obstacles(&mut self, input: &GridInput, newest: DVec3) {
+        let since = self.since_obstacles.as_ref();
+        let is_due = since.is_none_or(|watch| watch.secs() >= self.obstacles_period);
+        if !is_due && !input.is_last {
+            return;
+        }
+        let watch = Stopwatch::start();
+        let reach = OBSTACLES_REACH * self.params.max_range;
+        let n = self.params.max_ellipsoids as usize;
+        let (stream, publisher) = (&self.stream, &self.publisher);
+        let send = || stream.publish_obstacles(publisher, &input.snapshot, (newest, reach), n);
+        let sent = match &self.pool {
+            Some(pool) => pool.install(send),
+            None => send(),
+        };
+        if let Err(e) = sent {
+            let text = format_args!("ellipsoids and voxels did not go out: {e}");
+            self.rate_limited.warn(text);
+        }
+        self.obstacles_period = OBSTACLES_SECS.max(watch.secs() / OBSTACLES_SHARE);
+        tracing::debug!("obstacles took {:.1} ms", 1e3 * watch.secs());
+        self.since_obstacles = Some(Stopwatch::start());
     }
 
     fn warn_of(&mut self, faults: &[VolumeError]) {

@@ -18,6 +18,7 @@ use crate::params::params::Params;
 use splat_engine::error::EngineError;
 use splat_geometry::answer::GeometryBatch;
 use splat_io::queue::Sender;
+use splat_ros::odometry::FrameCells;
 use splat_ros::output::Output;
 use splat_ros::reports::Reports;
 use splat_ros::status::MapStatus;
@@ -70,6 +71,8 @@ struct Snapshots {
     since_last: Stopwatch,
     /// Keyframes go along with their depth.
     has_grid: bool,
+    /// `None`: nothing goes out.
+    frames: Option<Arc<FrameCells>>,
 }
 
 /// Live: when steps are made, and by which threads.
@@ -123,6 +126,7 @@ impl MapStage {
         recovery: Recovery,
         output: Option<&mut Output>,
     ) -> Self {
+        let frames = output.as_ref().map(|o| Arc::clone(&o.handles.frames));
         let (reports, calls) = output
             .map(|output| (Arc::clone(&output.handles.reports), output.calls.take()))
             .unzip();
@@ -141,6 +145,7 @@ impl MapStage {
             snapshots: Snapshots {
                 since_last: Stopwatch::start(),
                 has_grid: params.grid.enabled && reports.is_some(),
+                frames,
             },
             reports,
             autosave: None,
@@ -469,6 +474,9 @@ impl MapStage {
     /// `None` once mapping has ended.
     fn snapshot(&mut self) -> Option<Arc<Snapshot>> {
         self.report_counts();
+        if let Some(frame) = self.snapshots.frames.as_ref().and_then(|f| f.map_frame()) {
+            self.map.set_map_frame(frame);
+        }
         if let (Some(moved), Some(reports)) = (self.map.take_correction(), &self.reports) {
             reports.correction.add(moved);
         }

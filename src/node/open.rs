@@ -13,6 +13,7 @@ use crate::node::recovery::Recovery;
 use crate::node::stop::ShutdownTimeout;
 use crate::node::track_thread::TrackStage;
 use splat_io::queue::{WhenFull, queue};
+use splat_ros::odometry::saved_map_frame;
 use splat_slam::mapper::map_file::checkpoint;
 use splat_slam::mapper::mapper::Mapper;
 use splat_slam::mapper::params::Start;
@@ -42,6 +43,10 @@ pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
     if !params.map.resume.is_empty() {
         let saved = checkpoint::read(Path::new(&params.map.resume))?;
         track.begin_in(&saved.landmarks, &params.track)?;
+        if let Some(output) = &job.output {
+            let frame = saved_map_frame(saved.map_frame, &saved.snapshot.poses);
+            output.handles.frames.set_map_frame(frame);
+        }
         map = map
             .resume_report(saved, &params.track)
             .map_err(|reason| anyhow!("cannot go on from {}: {reason}", params.map.resume))?;

@@ -4,6 +4,7 @@ use crate::formats::planner_map;
 use crate::node::grid_thread::keyframes_of;
 use crate::node::job::Outcome;
 use crate::report::top_view::TopView;
+use splat_ros::odometry::beginning_at;
 use splat_slam::track::landmarks::KeyframeView;
 use splat_volume::params::GridParams;
 
@@ -33,8 +34,9 @@ pub(crate) fn top_view(outcome: &mut Outcome, params: &GridParams) -> Option<Top
         Some(ASSUMED_DEPTH / f64::from(*middle))
     };
     let first = views.first()?.world_from_cam;
-    let scale = metres.or_else(guess)?;
-    let map_from_world = planner_map::map_from_world(first, Some(scale));
+    let frame = outcome.map.map_frame();
+    let frame = frame.unwrap_or_else(|| beginning_at(first));
+    let map_from_world = frame.map_from_world(metres.or_else(guess)?);
     let keyframes = keyframes_of(views.iter().step_by(every), &map_from_world);
     let mut volume = planner_map::fused(&keyframes, params);
     let level = volume.level_from_map();

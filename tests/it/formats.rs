@@ -9,6 +9,7 @@ use glam::{DQuat, DVec3};
 use splat_mapper::node::save_map::{MapFile, save_map};
 use splat_slam::mapper::map_file::checkpoint::{self, Checkpoint, CheckpointError};
 use splat_types::camera::Intrinsics;
+use splat_types::map_frame::MapFrame;
 use splat_types::snapshot::{KeyframePose, Scale, Snapshot};
 use splat_types::splats::ply;
 use splat_types::splats::splats::Splats;
@@ -94,6 +95,10 @@ fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
     Checkpoint {
         landmarks: vec![7; 33],
         update_counts: (0..n_splats as u16).collect(),
+        map_frame: Some(MapFrame {
+            world_from_cam: Rigid::new(DQuat::from_rotation_x(0.3), DVec3::new(1.0, -2.0, 0.5)),
+            map_from_cam: Rigid::new(DQuat::from_rotation_z(-0.7), DVec3::new(0.0, 3.0, 1.2)),
+        }),
         ..Checkpoint::of(random_snapshot(n_splats, 5, sh_degree, 9), 11, 3000)
     }
 }
@@ -119,7 +124,25 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         assert_eq!((back.seed, back.steps), (11, 3000));
         assert_eq!(back.landmarks, written.landmarks);
         assert_eq!(back.update_counts, written.update_counts);
+        assert_eq!(back.map_frame, written.map_frame);
     }
+    // Older files have no such section, and a map that no robot was told of an empty one.
+    let written = Checkpoint {
+        map_frame: None,
+        ..checkpoint(10, 0)
+    };
+    save_map(MapFile::Checkpoint(&written), &path).unwrap();
+    assert_eq!(checkpoint::read(&path).unwrap().map_frame, None);
+    let broken = Checkpoint {
+        map_frame: Some(MapFrame {
+            world_from_cam: Rigid::IDENTITY,
+            map_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::NAN),
+        }),
+        ..checkpoint(10, 0)
+    };
+    save_map(MapFile::Checkpoint(&broken), &path).unwrap();
+    let refused = checkpoint::read(&path).unwrap_err().to_string();
+    assert!(refused.contains("MFRM"), "{refused}");
 }
 
 #[test]
@@ -136,7 +159,7 @@ fn a_checkpoint_cut_anywhere_is_an_error() {
         end += 16 + n;
     }
     assert_eq!(boundaries.pop(), Some(bytes.len()));
-    assert_eq!(boundaries.len(), 5 + 4 * 7 - 1);
+    assert_eq!(boundaries.len(), 5 + 4 * 8 - 1);
     let mut dice = Dice(5);
     boundaries.extend((0..200).map(|_| dice.below(bytes.len())));
     for cut in boundaries {

@@ -23,7 +23,7 @@ use splat_volume::params::GridParams;
 
 const SCENE: &str = "synthetic:room?frames=48&width=320&height=240";
 
-fn take() -> Take {
+pub(crate) fn take() -> Take {
     let settings = SynthSettings {
         n_frames: 48,
         width_px: 320,
@@ -43,7 +43,7 @@ fn replayed(input: &str, geometry: &str, out: &Path, more: &[&str]) {
 }
 
 /// The same of the room, with all that goes out recorded.
-fn recorded(geometry: &str, out: &Path, sent: &Path, sets: &[&str]) {
+pub(crate) fn recorded(geometry: &str, out: &Path, sent: &Path, sets: &[&str]) {
     let record = format!("publish.record={}", sent.display());
     let mut more = vec!["--steps", "10", "--set", &record];
     more.extend(sets.iter().flat_map(|set| ["--set", set]));
@@ -51,7 +51,7 @@ fn recorded(geometry: &str, out: &Path, sent: &Path, sets: &[&str]) {
 }
 
 /// Each message of a topic.
-fn messages(sent: &Path, topic: &str) -> Vec<Vec<u8>> {
+pub(crate) fn messages(sent: &Path, topic: &str) -> Vec<Vec<u8>> {
     let bytes = std::fs::read(sent).unwrap();
     let all = mcap::MessageStream::new(&bytes).unwrap();
     all.map(Result::unwrap)
@@ -160,7 +160,7 @@ fn frame_of(take: &Take, pose: &KeyframePose) -> u32 {
 }
 
 /// In metres.
-fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
+pub(crate) fn exact(map: &Checkpoint, take: &Take) -> Checkpoint {
     with_depth(map, |pose| {
         take.depth(frame_of(take, pose), &pose.intrinsics)
     })

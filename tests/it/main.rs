@@ -44,6 +44,7 @@ mod lpips;
 mod metric_scale;
 mod mvs;
 mod node_over_zenoh;
+mod obstacles;
 mod old_names;
 mod onnx;
 mod onnx_models;

@@ -13,7 +13,9 @@ from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from nvblox_msgs.msg import DistanceMapSlice
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from splat_mapper_msgs.srv import GetDistances
+from sensor_msgs.msg import PointCloud2
+from splat_mapper_msgs.msg import EllipsoidArray
+from splat_mapper_msgs.srv import GetDistanceBox, GetDistances, GetEllipsoids, GetMesh
 from tf2_msgs.msg import TFMessage
 
 from mapper import ROOT, Checks, Mapper, Observer, wait_until
@@ -86,6 +88,50 @@ def ask_distances(observer, layer, slice_):
     check("a frame that it does not know is refused", not other.success and "map" in other.message, other.message)
 
 
+def ask_boxes(observer, voxels, ellipsoids):
+    """What is in a box around an occupied voxel: the services beside the topics."""
+    points = numpy.frombuffer(bytes(voxels.data), dtype="<f4").reshape(-1, 3)
+    check("voxels are middles of 5 cm", numpy.allclose(points / 0.05 % 1, 0.5, atol=1e-2) and len(points) > 2000, len(points))
+    means = numpy.array(ellipsoids.means).reshape(-1, 3)
+    axes = numpy.array(ellipsoids.semi_axes).reshape(-1, 3)
+    whole = len(means) == len(axes) == len(ellipsoids.ids) == len(ellipsoids.observations) > 100
+    check("ellipsoids are whole", whole and (axes > 0).all(), len(means))
+    check("each was seen often enough", min(ellipsoids.observations) >= ellipsoids.min_observations >= 3)
+    # Around the busiest place.
+    place = points[numpy.argmax([(numpy.linalg.norm(points - p, axis=1) < 0.4).sum() for p in points[:: len(points) // 200]]) * (len(points) // 200)]
+    low, high = place - 0.4, place + 0.4
+    corners = {"low": low.astype(numpy.float32), "high": high.astype(numpy.float32)}
+
+    box = observer.call(GetDistanceBox, "/splat_mapper/get_distance_box", GetDistanceBox.Request(**corners))
+    good = check("get_distance_box answers", box is not None and box.success, box and box.message)
+    if good:
+        n_x, n_y, n_z = box.size
+        distances = numpy.array(box.distances).reshape(n_z, n_y, n_x)
+        index = numpy.round((place - numpy.array(box.origin)) / box.resolution).astype(int)
+        here = distances[index[2], index[1], index[0]]
+        check("a voxel of a surface is at the surface", abs(here) <= 0.05, here)
+        request = GetDistances.Request(frame_id=box.frame_id, points=[float(v) for v in place])
+        single = observer.call(GetDistances, "/splat_mapper/get_distances", request)
+        check("and get_distances says the same", abs(single.distances[0] - here) < 1e-5, single.distances[0])
+
+    mesh = observer.call(GetMesh, "/splat_mapper/get_mesh", GetMesh.Request(**corners))
+    if check("get_mesh answers", mesh is not None and mesh.success, mesh and mesh.message):
+        vertices = numpy.array(mesh.vertices).reshape(-1, 3)
+        colors = numpy.array(mesh.colors).reshape(-1, 3)
+        check("each vertex has a colour", len(colors) == len(vertices) > 50, len(vertices))
+        check("some are no grey", (colors != 128).any(axis=1).mean() > 0.3, (colors != 128).any(axis=1).mean())
+        check("triangles are of vertices", len(mesh.triangles) % 3 == 0 and max(mesh.triangles) < len(vertices))
+
+    near = observer.call(GetEllipsoids, "/splat_mapper/get_ellipsoids", GetEllipsoids.Request(**corners))
+    if check("get_ellipsoids answers", near is not None and near.success, near and near.message):
+        found = numpy.array(near.ellipsoids.means).reshape(-1, 3)
+        inside = (found >= low - 1e-4).all() and (found <= high + 1e-4).all()
+        check("those of the box and no others", inside and len(found) > 0, len(found))
+    large = GetMesh.Request(low=numpy.full(3, -1e3, numpy.float32), high=numpy.full(3, 1e3, numpy.float32))
+    refused = observer.call(GetMesh, "/splat_mapper/get_mesh", large)
+    check("too large a box is refused in words", not refused.success and "50 m" in refused.message, refused.message)
+
+
 def main():
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True)
@@ -132,6 +178,10 @@ def main():
     check("and none through a wall", n_crossed == 0, n_crossed)
 
     ask_distances(late, layer, newest)
+    clouds = late.listen(PointCloud2, "/splat_mapper/voxels", MAP)
+    arrays = late.listen(EllipsoidArray, "/splat_mapper/ellipsoids", MAP)
+    if check("voxels and ellipsoids come late, too", wait_until(lambda: clouds and arrays, 10)):
+        ask_boxes(late, clouds[-1][1], arrays[-1][1])
 
     page = OUT / "map.yaml"
     program = os.environ["SPLAT_MAPPER"]

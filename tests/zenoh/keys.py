@@ -27,6 +27,8 @@ TOPICS = [
     ("/splat_mapper/grid", "nav_msgs::msg::dds_::OccupancyGrid_", latched(1)),
     ("/splat_mapper/grid_updates", "map_msgs::msg::dds_::OccupancyGridUpdate_", reliable(10)),
     ("/splat_mapper/distance_slice", "nvblox_msgs::msg::dds_::DistanceMapSlice_", latched(1)),
+    ("/splat_mapper/ellipsoids", "splat_mapper_msgs::msg::dds_::EllipsoidArray_", latched(1)),
+    ("/splat_mapper/voxels", "sensor_msgs::msg::dds_::PointCloud2_", latched(1)),
     ("/tf_static", "tf2_msgs::msg::dds_::TFMessage_", latched(1)),
     ("/splat_mapper/frusta", "visualization_msgs::msg::dds_::MarkerArray_", latched(1)),
     ("/splat_mapper/keyframes", "splat_mapper_msgs::msg::dds_::KeyframeArray_", latched(64)),
@@ -50,6 +52,9 @@ SERVICES = [
     ("/splat_mapper/get_splats", "splat_mapper_msgs::srv::dds_::GetSplats_"),
     ("/splat_mapper/render_view", "splat_mapper_msgs::srv::dds_::RenderView_"),
     ("/splat_mapper/get_distances", "splat_mapper_msgs::srv::dds_::GetDistances_"),
+    ("/splat_mapper/get_distance_box", "splat_mapper_msgs::srv::dds_::GetDistanceBox_"),
+    ("/splat_mapper/get_ellipsoids", "splat_mapper_msgs::srv::dds_::GetEllipsoids_"),
+    ("/splat_mapper/get_mesh", "splat_mapper_msgs::srv::dds_::GetMesh_"),
 ]
 
 

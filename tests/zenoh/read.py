@@ -233,6 +233,11 @@ def check_services(session, report):
     asked = {"frame_id": "odom", "points": numpy.zeros(3, dtype=numpy.float32), "max_distance": 0.0}
     refused = own("get_distances", "GetDistances", asked, session)
     expect(not refused.success and refused.message, f"get_distances says why not: {refused.message}")
+    corners = {"low": numpy.zeros(3, dtype=numpy.float32), "high": numpy.ones(3, dtype=numpy.float32)}
+    for name, kind in [("get_ellipsoids", "GetEllipsoids"), ("get_mesh", "GetMesh"), ("get_distance_box", "GetDistanceBox")]:
+        more = {"max_distance": 0.0} if kind == "GetDistanceBox" else {}
+        refused = own(name, kind, {"frame_id": "odom"} | corners | more, session)
+        expect(not refused.success and refused.message, f"{name} says why not: {refused.message}")
     expect(trigger("pause", session) and trigger("resume", session), "pause and resume")
 
 

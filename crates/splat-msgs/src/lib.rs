@@ -5,6 +5,8 @@ pub mod ros;
 
 pub mod correction_message;
 
+pub mod ellipsoid_message;
+
 pub mod services;
 
 pub mod status_message;

@@ -1,5 +1,6 @@
 //! The services that the node offers: names, types, definitions.
 
+use crate::ellipsoid_message;
 use crate::ros::standard::TriggerResponse;
 use crate::ros::{
     Message, camera_info_body, header_def, image_body, pose_def, quaternion_def, region_def,
@@ -30,6 +31,9 @@ pub enum Kind {
     GetSplats,
     RenderView,
     GetDistances,
+    GetDistanceBox,
+    GetEllipsoids,
+    GetMesh,
 }
 
 macro_rules! trigger {
@@ -54,6 +58,7 @@ const GET_SPLATS_RESPONSE: &str = concat!(
     "MSG: splat_mapper_msgs/SplatChunk\n",
     include_str!("../msgs/msg/SplatChunk.msg")
 );
+const BOX_REQUEST: &str = "string frame_id\nfloat32[3] low\nfloat32[3] high\n";
 const RENDER_VIEW_REQUEST: &str = concat!(
     "std_msgs/Header header\ngeometry_msgs/Pose pose\nsensor_msgs/CameraInfo camera\nbool with_depth\n",
     pose_def!(),
@@ -72,7 +77,7 @@ const RENDER_VIEW_RESPONSE: &str = concat!(
 );
 
 /// All of them.
-pub static SERVICES: [Service; 9] = [
+pub static SERVICES: [Service; 12] = [
     Service {
         name: "save_map",
         type_name: "splat_mapper_msgs/srv/SaveMap",
@@ -120,5 +125,32 @@ pub static SERVICES: [Service; 9] = [
             "bool[] known\n"
         ),
         kind: Kind::GetDistances,
+    },
+    Service {
+        name: "get_distance_box",
+        type_name: "splat_mapper_msgs/srv/GetDistanceBox",
+        request_definition: "string frame_id\nfloat32[3] low\nfloat32[3] high\nfloat32 max_distance\n",
+        response_definition: concat!(
+            "bool success\nstring message\nstring frame_id\nuint32 epoch\nuint32 revision\nfloat32 resolution\n",
+            "float32[3] origin\nuint32[3] size\nfloat32[] distances\nbool[] known\n"
+        ),
+        kind: Kind::GetDistanceBox,
+    },
+    Service {
+        name: "get_ellipsoids",
+        type_name: "splat_mapper_msgs/srv/GetEllipsoids",
+        request_definition: BOX_REQUEST,
+        response_definition: ellipsoid_message::RESPONSE_DEFINITION,
+        kind: Kind::GetEllipsoids,
+    },
+    Service {
+        name: "get_mesh",
+        type_name: "splat_mapper_msgs/srv/GetMesh",
+        request_definition: BOX_REQUEST,
+        response_definition: concat!(
+            "bool success\nstring message\nstring frame_id\nuint32 epoch\nuint32 revision\nfloat32[] vertices\n",
+            "uint8[] colors\nuint32[] triangles\n"
+        ),
+        kind: Kind::GetMesh,
     },
 ];

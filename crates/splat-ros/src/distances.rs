@@ -1,28 +1,16 @@
 //! Questions for distances -> answers, from the volume as it last was.
 
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::shared_volume::SharedVolume;
 use splat_volume::field;
-use splat_volume::voxels::Voxels;
 
 /// Points of one question, 1.2 MB.
 const MAX_POINTS: usize = 100_000;
 /// Metres.
 const DEFAULT_DISTANCE: f64 = 2.0;
 const MAX_DISTANCE: f64 = 5.0;
-
-/// A volume that planners may ask; its blocks are shared with the one that goes on.
-#[derive(Debug, Clone)]
-pub struct SharedVolume {
-    pub voxels: Voxels,
-    pub level_from_map: DQuat,
-    pub map_frame: String,
-    /// Of `voxels`.
-    pub level_frame: String,
-    pub epoch: u32,
-    pub revision: u32,
-}
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GetDistancesRequest {
@@ -53,13 +41,27 @@ impl GetDistancesResponse {
     }
 }
 
+pub(crate) fn no_volume() -> String {
+    "there is no volume yet: status.warnings says why, if it is not to come".to_owned()
+}
+
+/// As it was asked for, or why not.
+pub(crate) fn max_distance(asked: f32) -> Result<f64, String> {
+    let max = f64::from(asked);
+    if !(0.0..=MAX_DISTANCE).contains(&max) {
+        return Err(format!(
+            "max_distance is {max}, 0 to {MAX_DISTANCE} m are possible"
+        ));
+    }
+    Ok(if max == 0.0 { DEFAULT_DISTANCE } else { max })
+}
+
 /// `Err`: why not.
 pub(crate) fn answer(
     volume: Option<&SharedVolume>,
     asked: &GetDistancesRequest,
 ) -> Result<GetDistancesResponse, String> {
-    let volume =
-        volume.ok_or("there is no volume yet: status.warnings says why, if it is not to come")?;
+    let volume = volume.ok_or_else(no_volume)?;
     let (points, rest) = asked.points.as_chunks::<3>();
     let n = points.len();
     if !rest.is_empty() {
@@ -73,28 +75,13 @@ pub(crate) fn answer(
             "{n} points, at most {MAX_POINTS}: ask several times"
         ));
     }
-    let max = f64::from(asked.max_distance);
-    if !(0.0..=MAX_DISTANCE).contains(&max) {
-        return Err(format!(
-            "max_distance is {max}, 0 to {MAX_DISTANCE} m are possible"
-        ));
-    }
-    let max = if max == 0.0 { DEFAULT_DISTANCE } else { max };
+    let max = max_distance(asked.max_distance)?;
     let frame = if asked.frame_id.is_empty() {
-        &volume.map_frame
+        &volume.frames.map
     } else {
         &asked.frame_id
     };
-    let level_from_frame = if *frame == volume.level_frame {
-        DQuat::IDENTITY
-    } else if *frame == volume.map_frame {
-        volume.level_from_map
-    } else {
-        return Err(format!(
-            "points in the frame {frame:?}, which is neither {:?} nor {:?}",
-            volume.map_frame, volume.level_frame
-        ));
-    };
+    let level_from_frame = volume.level_from_frame(frame, "")?;
     let points: Vec<DVec3> = points
         .iter()
         .map(|p| level_from_frame * DVec3::from_array(p.map(f64::from)))
@@ -119,16 +106,11 @@ pub(crate) fn answer(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared_volume::tests::empty;
+    use glam::DQuat;
 
     fn volume() -> SharedVolume {
-        SharedVolume {
-            voxels: Voxels::new(0.05, 0.2),
-            level_from_map: DQuat::from_rotation_x(0.2),
-            map_frame: "map".to_owned(),
-            level_frame: "map_level".to_owned(),
-            epoch: 3,
-            revision: 17,
-        }
+        empty(DQuat::from_rotation_x(0.2))
     }
 
     fn asked(points: Vec<f32>) -> GetDistancesRequest {

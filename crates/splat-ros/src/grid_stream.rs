@@ -2,24 +2,27 @@
 
 use std::sync::Arc;
 
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 
-use crate::distances::SharedVolume;
 use crate::error::PublishError;
+use crate::obstacles::{ELLIPSOIDS, VOXELS, ellipsoid_array, voxel_cloud};
 use crate::odometry::FrameCells;
 use crate::params::PublishParams;
 use crate::publisher::Publisher;
 use crate::reports::Reports;
+use crate::shared_volume::{SharedVolume, VolumeFrames};
 use crate::transport::{Delivery, Event, Sample, Topic};
 use splat_msgs::ros::navigation::{
     DistanceMapSlice, MapMetaData, OccupancyGrid, OccupancyGridUpdate,
 };
 use splat_msgs::ros::{Header, Pose, TfMessage, TransformStamped, Vector3};
+use splat_types::snapshot::Snapshot;
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::{Rigid, Similarity};
 use splat_volume::distance::{UNKNOWN_DISTANCE, signed_distances};
+use splat_volume::ellipsoids::Region;
 use splat_volume::grid::{Extent, Grid};
-use splat_volume::voxels::Voxels;
+use splat_volume::volume::Volume;
 
 pub static GRID: Topic = Topic::of::<OccupancyGrid>("grid", Delivery::Latched { depth: 1 });
 /// Below the name of the grid, as Nav2's static layer looks for it.
@@ -100,21 +103,41 @@ impl GridStream {
     }
 
     /// Services answer from it until the next one.
-    pub fn keep_volume(
+    pub fn keep_volume(&self, publisher: &Publisher, volume: &Volume, snapshot: &Snapshot) {
+        let level_from_map = volume.level_from_map();
+        publisher.latched().keep_volume(SharedVolume {
+            voxels: volume.voxels().clone(),
+            keyframes: volume.fused(),
+            max_range: volume.params().max_range,
+            level_from_map,
+            level_from_world: volume.in_level(&self.map_from_world(snapshot.scale.metres_per_unit)),
+            frames: VolumeFrames {
+                map: self.params.map_frame.clone(),
+                level: self.frame_of(level_from_map),
+            },
+            map_id: snapshot.map_id,
+            epoch: snapshot.epoch,
+            revision: snapshot.revision,
+        });
+    }
+
+    /// Sends what lies within `reach` metres of a place of the level frame, as the volume that was kept last has it.
+    pub fn publish_obstacles(
         &self,
         publisher: &Publisher,
-        voxels: Voxels,
-        level_from_map: DQuat,
-        (epoch, revision): (u32, u32),
-    ) {
-        publisher.latched().keep_volume(SharedVolume {
-            voxels,
-            level_from_map,
-            map_frame: self.params.map_frame.clone(),
-            level_frame: self.frame_of(level_from_map),
-            epoch,
-            revision,
-        });
+        snapshot: &Snapshot,
+        (place, reach): (DVec3, f64),
+        max_ellipsoids: usize,
+    ) -> Result<(), PublishError> {
+        let Some(volume) = publisher.latched().volume() else {
+            return Ok(());
+        };
+        let region = Region::around(place, reach);
+        let header = Header::new(snapshot.stamp, &volume.frames.level);
+        let cloud = voxel_cloud(&volume, &region, header);
+        publisher.send(&Sample::of(&VOXELS, snapshot.stamp, &cloud)?)?;
+        let array = ellipsoid_array(&volume, snapshot, &region, max_ellipsoids);
+        publisher.send(&Sample::of(&ELLIPSOIDS, snapshot.stamp, &array)?)
     }
 
     /// Sends what has changed; nothing where nothing has.
@@ -180,7 +203,7 @@ impl GridStream {
     }
 
     fn level_transform(&self, level_grid: &LevelGrid, frame: &str) -> Result<Sample, PublishError> {
-        let pose = Rigid::new(level_grid.level_from_map.inverse(), glam::DVec3::ZERO);
+        let pose = Rigid::new(level_grid.level_from_map.inverse(), DVec3::ZERO);
         let transform = TransformStamped {
             header: Header::new(level_grid.stamp, &self.params.map_frame),
             child_frame_id: frame.to_owned(),

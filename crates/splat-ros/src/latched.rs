@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use crate::distances::SharedVolume;
 use crate::error::PublishError;
+use crate::shared_volume::SharedVolume;
 use crate::transport::{Delivery, Sample, Topic};
 use splat_io::latest::Latest;
 use splat_msgs::map_messages::{KeyframeArray, Messages, SplatChunk, SplatManifest};

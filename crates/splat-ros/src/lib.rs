@@ -4,7 +4,13 @@ pub mod error;
 
 pub mod transport;
 
+pub mod shared_volume;
+
+pub mod obstacles;
+
 pub mod distances;
+
+pub mod box_services;
 
 pub mod latched;
 

@@ -5,6 +5,8 @@ use nalgebra::{Matrix3, Matrix6};
 
 use splat_io::latest::Latest;
 use splat_types::covariance::Covariance;
+use splat_types::map_frame::MapFrame;
+use splat_types::snapshot::KeyframePose;
 use splat_types::time::Stamp;
 use splat_types::tracking::{TrackState, TrackedFrame};
 use splat_types::transform::{Rigid, Similarity};
@@ -28,6 +30,21 @@ pub fn forward_camera() -> Rigid {
     Rigid::new(DQuat::from_mat3(&axes), DVec3::ZERO)
 }
 
+/// The map frame of a robot whose camera looks ahead and is where the map begins.
+pub fn beginning_at(world_from_cam: Rigid) -> MapFrame {
+    MapFrame {
+        world_from_cam,
+        map_from_cam: forward_camera(),
+    }
+}
+
+/// Of a saved map: as it was saved, or beginning at its first keyframe.
+pub fn saved_map_frame(saved: Option<MapFrame>, poses: &[KeyframePose]) -> MapFrame {
+    let first = poses.iter().min_by_key(|pose| pose.keyframe_id);
+    let first = first.map_or(Rigid::IDENTITY, |pose| pose.world_from_cam);
+    saved.unwrap_or_else(|| beginning_at(first))
+}
+
 /// Reads `x y z qx qy qz qw`.
 pub fn parse_transform(text: &str) -> Option<Rigid> {
     let numbers: Vec<f64> = text
@@ -43,11 +60,10 @@ pub fn parse_transform(text: &str) -> Option<Rigid> {
     is_sound.then(|| Rigid::new(rotation / length, translation))
 }
 
-/// Where the splats' frame lies in the map frame: fixed by the first frame that was seen in both.
+/// Where the splats' frame lies in the map frame: fixed by the first frame that was seen in both, or by the map that a run goes on from.
 #[derive(Debug, Clone, Default)]
 pub struct FrameTree {
-    /// (world_from_cam, map_from_cam) of that frame.
-    anchor: Option<(Rigid, Rigid)>,
+    anchor: Option<MapFrame>,
     /// Metres of one unit of the splats; `None` while unknown, when both frames share one unit.
     pub metres_per_unit: Option<f64>,
 }
@@ -59,27 +75,24 @@ impl FrameTree {
 
     /// The map frame begins where `world_from_cam` says, for a camera that the splats see at `world_from_cam`.
     pub fn anchor(&mut self, world_from_cam: Rigid, map_from_cam: Rigid) {
-        self.anchor = Some((world_from_cam, map_from_cam));
+        self.anchor = Some(MapFrame {
+            world_from_cam,
+            map_from_cam,
+        });
     }
 
     pub fn map_from_world(&self) -> Similarity {
         let scale = self.metres_per_unit.unwrap_or(1.0);
-        let (world_from_cam, map_from_cam) =
-            self.anchor.unwrap_or((Rigid::IDENTITY, forward_camera()));
-        let rotation = map_from_cam.rotation * world_from_cam.rotation.inverse();
-        Similarity {
-            scale,
-            rotation,
-            translation: map_from_cam.translation - rotation * world_from_cam.translation * scale,
-        }
+        let anchor = self.anchor.unwrap_or_else(|| beginning_at(Rigid::IDENTITY));
+        anchor.map_from_world(scale)
     }
 }
 
 /// What a `FrameTree` is made of, for threads that share it; each cell has one writer.
 #[derive(Debug, Default)]
 pub struct FrameCells {
-    /// Written once, by the thread that follows the tracker.
-    anchor: Latest<Option<(Rigid, Rigid)>>,
+    /// Written once, by the thread that follows the tracker, unless a map brings its own.
+    anchor: Latest<Option<MapFrame>>,
     /// Written with every snapshot that goes out.
     metres_per_unit: Latest<Option<f64>>,
 }
@@ -98,6 +111,16 @@ impl FrameCells {
         if tree.is_anchored() && self.anchor.get().is_none() {
             self.anchor.set(tree.anchor);
         }
+    }
+
+    /// `None` before the first frame with a pose.
+    pub fn map_frame(&self) -> Option<MapFrame> {
+        *self.anchor.get()
+    }
+
+    /// Of a map that a run goes on from; before frames come.
+    pub fn set_map_frame(&self, frame: MapFrame) {
+        self.anchor.set(Some(frame));
     }
 
     pub fn set_metres_per_unit(&self, metres: Option<f64>) {

@@ -12,6 +12,7 @@ use crate::latched::{self, LatchedStore};
 use crate::map_stream::{self, MapStream};
 use crate::mcap_transport::McapTransport;
 use crate::navigation;
+use crate::obstacles;
 use crate::odometry::FrameCells;
 use crate::params::PublishParams;
 use crate::pose_messages;
@@ -32,6 +33,7 @@ pub fn topics() -> Vec<&'static Topic> {
         &latched::TOPICS,
         &map_stream::TOPICS,
         &grid_stream::TOPICS,
+        &obstacles::TOPICS,
         &status::TOPICS,
     ]
     .concat()
@@ -52,6 +54,7 @@ pub struct OutputHandles {
     pub publisher: Arc<Publisher>,
     pub reports: Arc<Reports>,
     pub controls: Arc<Controls>,
+    pub frames: Arc<FrameCells>,
 }
 
 /// What goes from message to message, each part owned by one thread; it outlives a map that is thrown away.
@@ -131,7 +134,7 @@ impl Output {
         let streams = Streams {
             map: MapStream::new(params, Arc::clone(&reports), Arc::clone(&cells)),
             grid: GridStream::new(params, Arc::clone(&reports), Arc::clone(&cells)),
-            poses: PoseStream::new(mount, params, Arc::clone(&reports), cells),
+            poses: PoseStream::new(mount, params, Arc::clone(&reports), Arc::clone(&cells)),
             status: StatusStream::new(params, Arc::clone(&reports)),
         };
         Ok(Self {
@@ -139,6 +142,7 @@ impl Output {
                 publisher: Arc::new(Publisher::new(transports, latched, service_server)),
                 reports,
                 controls,
+                frames: cells,
             },
             streams,
             calls: Some(calls),

@@ -11,15 +11,18 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::box_services::{self, Refused};
 use crate::distances::{self, GetDistancesRequest, GetDistancesResponse};
 use crate::latched::LatchedStore;
 use crate::render_view::{Frames, RenderViewRequest, RenderViewResponse};
+use crate::shared_volume::SharedVolume;
 use splat_msgs::map_messages::{MAX_MESSAGE_BYTES, SplatChunk, SplatManifest};
 use splat_msgs::ros;
 use splat_msgs::ros::standard::TriggerResponse;
 use splat_msgs::services::Kind;
 use splat_types::camera::Intrinsics;
 use splat_types::rendering::Rendering;
+use splat_types::snapshot::Snapshot;
 use splat_types::transform::Rigid;
 
 /// How long a client waits for the map's thread, which may be at geometry of a large batch.
@@ -150,6 +153,11 @@ impl ServiceServer {
             Kind::GetSplats => self.get_splats(question),
             Kind::RenderView => self.render_view(question),
             Kind::GetDistances => self.get_distances(question),
+            Kind::GetDistanceBox => self.of_volume(question, |volume, _, asked| {
+                box_services::distance_box(volume, asked)
+            }),
+            Kind::GetEllipsoids => self.of_volume(question, box_services::ellipsoids),
+            Kind::GetMesh => self.of_volume(question, box_services::mesh),
         }
     }
 
@@ -290,6 +298,19 @@ impl ServiceServer {
         let asked = decoded::<GetDistancesRequest>(question);
         let response = asked.and_then(|asked| distances::answer(volume.as_deref(), &asked));
         encoded(&response.unwrap_or_else(GetDistancesResponse::refused))
+    }
+
+    /// What the volume and the published map say to a question.
+    fn of_volume<Q: for<'a> Deserialize<'a>, R: Refused>(
+        &self,
+        question: &[u8],
+        answer: impl FnOnce(Option<&SharedVolume>, Option<&Snapshot>, &Q) -> Result<R, String>,
+    ) -> Vec<u8> {
+        let (volume, map) = (self.latched.volume(), self.latched.map());
+        let snapshot = map.as_ref().map(|map| &*map.snapshot);
+        let asked = decoded::<Q>(question);
+        let response = asked.and_then(|asked| answer(volume.as_deref(), snapshot, &asked));
+        encoded(&response.unwrap_or_else(R::refused))
     }
 
     fn render_view(&self, question: &[u8]) -> Vec<u8> {

@@ -115,16 +115,27 @@ pub fn ellipsoids(
         .collect()
 }
 
-/// The nearest `n` to a place, in the order of their ids -> how many were left out.
-pub fn keep_nearest(ellipsoids: &mut Vec<Ellipsoid>, place: DVec3, n: usize) -> usize {
+/// What `keep_nearest` has left out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LeftOut {
+    pub n: usize,
+    /// Metres from the place to the nearest of them; infinite where there is none.
+    pub from: f64,
+}
+
+/// Keeps the nearest `n` to a place, in the order of their ids.
+pub fn keep_nearest(ellipsoids: &mut Vec<Ellipsoid>, place: DVec3, n: usize) -> LeftOut {
     let left_out = ellipsoids.len().saturating_sub(n);
+    let mut from = f64::INFINITY;
     if left_out > 0 {
         let distance = |e: &Ellipsoid| e.mean.distance_squared(place);
-        ellipsoids.select_nth_unstable_by(n, |a, b| distance(a).total_cmp(&distance(b)));
+        let by = |a: &Ellipsoid, b: &Ellipsoid| distance(a).total_cmp(&distance(b));
+        let (_, next, _) = ellipsoids.select_nth_unstable_by(n, by);
+        from = distance(next).sqrt();
         ellipsoids.truncate(n);
         ellipsoids.sort_unstable_by_key(|ellipsoid| ellipsoid.splat_id);
     }
-    left_out
+    LeftOut { n: left_out, from }
 }
 
 pub(crate) fn mean(splats: &Splats, ix: usize) -> DVec3 {
@@ -215,7 +226,9 @@ impl Scene<'_> {
             let on_surface = (0..=n).filter(|i| {
                 let share = 2.0 * f64::from(*i) / f64::from(n) - 1.0;
                 let place = ellipsoid.mean + axis * (reach * share);
-                let voxel = self.voxels.voxel((place / self.voxels.size).floor().as_ivec3());
+                let voxel = self
+                    .voxels
+                    .voxel((place / self.voxels.size).floor().as_ivec3());
                 let distance = voxel.distance(self.voxels.truncation);
                 distance.is_some_and(|metres| metres.abs() <= 1.5 * self.voxels.size)
             });

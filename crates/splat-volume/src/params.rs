@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GridParams {
-    /// Fuse verified depth and publish grid, grid_updates and distance_slice, where anything is published.
+    /// Fuse verified depth and publish grid, grid_updates, distance_slice, ellipsoids and voxels, where anything is published.
     pub enabled: bool,
     /// Side of a voxel and of a cell.
     #[schemars(range(min = 0.01, max = 1.0), extend("unit" = "m"))]
@@ -36,6 +36,9 @@ pub struct GridParams {
     /// Least time between two grids.
     #[schemars(range(min = 0.05, max = 60.0), extend("unit" = "s"))]
     pub period: f64,
+    /// Ellipsoids of splats near the robot in one message.
+    #[schemars(range(min = 0, max = 10000))]
+    pub max_ellipsoids: u32,
     /// Publish also where the scale is unknown: one unit of the map counts as a metre.
     pub allow_unscaled: bool,
 }
@@ -53,6 +56,7 @@ impl Default for GridParams {
             drop_off: 0.15,
             max_mib: 256,
             period: 0.5,
+            max_ellipsoids: 10_000,
             allow_unscaled: false,
         }
     }

@@ -236,7 +236,8 @@ impl Volume {
             + (new.scale / old.scale - 1.0).abs() * depth
     }
 
-    fn in_level(&self, map_from_camera: &Similarity) -> Similarity {
+    /// What leads to the map frame, led on to the level one.
+    pub fn in_level(&self, map_from_camera: &Similarity) -> Similarity {
         Similarity {
             scale: map_from_camera.scale,
             rotation: self.level_from_map * map_from_camera.rotation,

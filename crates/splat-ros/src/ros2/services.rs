@@ -3,7 +3,10 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use r2r::splat_mapper_msgs::srv::{Export, GetDistances, GetSplats, LoadMap, RenderView, SaveMap};
+use r2r::splat_mapper_msgs::srv::{
+    Export, GetDistanceBox, GetDistances, GetEllipsoids, GetMesh, GetSplats, LoadMap, RenderView,
+    SaveMap,
+};
 use r2r::std_srvs::srv::Trigger;
 use r2r::{QosProfile, ServiceRequest, WrappedServiceTypeSupport, WrappedTypesupport};
 
@@ -50,6 +53,13 @@ pub(crate) fn offer(
             Kind::GetSplats => serve::<GetSplats::Service>(link, name, service_server, jobs),
             Kind::RenderView => serve::<RenderView::Service>(link, name, service_server, jobs),
             Kind::GetDistances => serve::<GetDistances::Service>(link, name, service_server, jobs),
+            Kind::GetDistanceBox => {
+                serve::<GetDistanceBox::Service>(link, name, service_server, jobs)
+            }
+            Kind::GetEllipsoids => {
+                serve::<GetEllipsoids::Service>(link, name, service_server, jobs)
+            }
+            Kind::GetMesh => serve::<GetMesh::Service>(link, name, service_server, jobs),
         }
     })
 }

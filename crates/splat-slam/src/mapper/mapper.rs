@@ -42,6 +42,7 @@ use splat_engine::traits::Engine;
 use splat_geometry::answer::{GeometryBatch, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::frame::Batch;
+use splat_types::map_frame::MapFrame;
 use splat_types::snapshot::Scale;
 use splat_types::sparse_point::SparsePoint;
 
@@ -71,6 +72,8 @@ pub struct Mapper {
     start_points: StartPoints,
     /// `None` before anything was read.
     last_good: Option<Arc<LastGood>>,
+    /// Saved with the map.
+    map_frame: Option<MapFrame>,
 }
 
 impl std::fmt::Debug for Mapper {
@@ -94,6 +97,7 @@ impl Mapper {
             scale: MetricScale::new(scale),
             start_points: StartPoints::default(),
             last_good: None,
+            map_frame: None,
         }
     }
 
@@ -102,6 +106,15 @@ impl Mapper {
     pub fn measuring_scale(mut self, params: &ScaleParams) -> Self {
         self.scale.look_for(params);
         self
+    }
+
+    /// Where the robot's map frame lies; it is saved with the map.
+    pub fn set_map_frame(&mut self, frame: MapFrame) {
+        self.map_frame = Some(frame);
+    }
+
+    pub fn map_frame(&self) -> Option<MapFrame> {
+        self.map_frame
     }
 
     /// With `train.start: points`, these become the first splats, as keyframes come that have them in view. They lie in the frame

@@ -59,10 +59,7 @@ fn splats(blobs: &[Blob]) -> Splats {
                 mean.as_vec3().to_array()
             })
             .collect(),
-        log_scales: blobs
-            .iter()
-            .map(|b| b.sigmas.to_array().map(log))
-            .collect(),
+        log_scales: blobs.iter().map(|b| b.sigmas.to_array().map(log)).collect(),
         quats: vec![[q.w, q.x, q.y, q.z].map(|v| 1.7 * v as f32); blobs.len()],
         opacity_logits: blobs
             .iter()
@@ -125,7 +122,11 @@ fn ellipsoids_hold_the_surfaces_and_nothing_that_floats() {
     // Floaters: farther than a voxel and the agreement of depth from any surface.
     for i in 0..500 {
         let at = |k: i32| f64::from(i * k % 1000) / 1000.0;
-        let place = DVec3::new(0.3 + 5.4 * at(137), 0.3 + 4.4 * at(389), 0.2 + 2.1 * at(613));
+        let place = DVec3::new(
+            0.3 + 5.4 * at(137),
+            0.3 + 4.4 * at(389),
+            0.2 + 2.1 * at(613),
+        );
         if world.distance(place) > 0.15 {
             blobs.push(small(place));
         }
@@ -197,7 +198,11 @@ fn what_is_faint_seldom_seen_or_too_long_is_no_obstacle() {
     };
     let ids = [0, 1, 2, 3, 4];
     let found = ellipsoids(&scene, &broken, &ids, &level_from_world(), &all());
-    assert!(found.iter().all(|e| e.rotation.is_finite() && e.splat_id > 0));
+    assert!(
+        found
+            .iter()
+            .all(|e| e.rotation.is_finite() && e.splat_id > 0)
+    );
 }
 
 #[test]
@@ -209,12 +214,15 @@ fn the_nearest_are_kept() {
     let mut wanted: Vec<f64> = ellipsoids.iter().map(|e| e.mean.distance(place)).collect();
     wanted.sort_by(f64::total_cmp);
     let n = ellipsoids.len();
-    assert_eq!(keep_nearest(&mut ellipsoids, place, 100), n - 100);
+    let left_out = keep_nearest(&mut ellipsoids, place, 100);
+    assert_eq!(left_out.n, n - 100);
+    assert!((left_out.from - wanted[100]).abs() < 1e-12);
     let farthest = ellipsoids.iter().map(|e| e.mean.distance(place));
     let farthest = farthest.fold(0.0, f64::max);
     assert!((farthest - wanted[99]).abs() < 1e-12);
     assert!(ellipsoids.is_sorted_by_key(|e| e.splat_id));
-    assert_eq!(keep_nearest(&mut ellipsoids, place, 100), 0);
+    let none = keep_nearest(&mut ellipsoids, place, 100);
+    assert_eq!((none.n, none.from), (0, f64::INFINITY));
 }
 
 #[test]

@@ -13,11 +13,12 @@ use byteorder::{LittleEndian, ReadBytesExt, WriteBytesExt};
 use crate::mapper::keyframes::image_codec::SavedView;
 use crate::mapper::map_file::framing::{read_section, write_section};
 use crate::mapper::map_file::sections::{
-    keyframe_bytes, parse_keyframes, parse_regions, parse_splats, parse_views, regions_len,
-    splat_bytes, view_bytes, write_regions,
+    keyframe_bytes, map_frame_bytes, parse_keyframes, parse_map_frame, parse_regions, parse_splats,
+    parse_views, regions_len, splat_bytes, view_bytes, write_regions,
 };
 use crate::mapper::splats::region_codec::{age_bytes, parse_update_counts};
 use crate::mapper::splats::regions::Evicted;
+use splat_types::map_frame::MapFrame;
 use splat_types::snapshot::{Scale, Snapshot};
 use splat_types::splats::splats::Splats;
 use splat_types::time::Stamp;
@@ -36,6 +37,7 @@ const LANDMARKS: [u8; 4] = *b"LAND";
 const UPDATE_COUNTS: [u8; 4] = *b"AGES";
 const VIEWS: [u8; 4] = *b"VIEW";
 const EVICTED: [u8; 4] = *b"EVIC";
+const MAP_FRAME: [u8; 4] = *b"MFRM";
 
 /// All that a later run needs to show, export or continue a map.
 #[derive(Debug, Clone)]
@@ -44,6 +46,8 @@ pub struct Checkpoint {
     pub seed: u64,
     /// Optimiser updates made so far.
     pub steps: u64,
+    /// Where the robot's map frame lies; `None` where no robot was told.
+    pub map_frame: Option<MapFrame>,
     /// Landmarks by which a later run finds its place, as `track::Tracker` saves them; empty where there are none.
     pub landmarks: Vec<u8>,
     /// Updates that each splat has had, in their order; empty where unknown.
@@ -63,6 +67,7 @@ impl Checkpoint {
             snapshot,
             seed,
             steps,
+            map_frame: None,
             landmarks: Vec::new(),
             update_counts: Vec::new(),
             views: Vec::new(),
@@ -97,6 +102,7 @@ pub fn write(checkpoint: &Checkpoint, out: &mut dyn Write) -> io::Result<()> {
         (LANDMARKS, checkpoint.landmarks.clone()),
         (UPDATE_COUNTS, age_bytes(&checkpoint.update_counts)),
         (VIEWS, views),
+        (MAP_FRAME, map_frame_bytes(checkpoint.map_frame)),
     ];
     let mut header = Vec::with_capacity(FILE_HEADER_BYTES as usize);
     header.extend_from_slice(&MAGIC);
@@ -139,7 +145,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
     let n_sections = read_header(&mut file, path)?;
     let mut remaining_bytes = file_info.len() - FILE_HEADER_BYTES;
     let (mut meta, mut keyframes, mut splats, mut landmarks) = (None, None, None, None);
-    let (mut update_counts, mut views, mut evicted) = (None, None, None);
+    let (mut update_counts, mut views, mut evicted, mut map_frame) = (None, None, None, None);
     for section_ix in 0..n_sections {
         let (tag, content) = match read_section(&mut file, &mut remaining_bytes) {
             Ok(Ok(section)) => section,
@@ -154,6 +160,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
             UPDATE_COUNTS => fill_once(&mut update_counts, parse_update_counts(&content)),
             VIEWS => fill_once(&mut views, parse_views(&content)),
             EVICTED => fill_once(&mut evicted, parse_regions(&content)),
+            MAP_FRAME => fill_once(&mut map_frame, parse_map_frame(&content)),
             _ => Ok(()),
         };
         known.map_err(|reason| damaged(format!("section {}: {reason}", tag.escape_ascii())))?;
@@ -186,6 +193,7 @@ pub fn read(path: &Path) -> Result<Checkpoint, CheckpointError> {
         landmarks: landmarks.unwrap_or_default(),
         update_counts,
         views: views.unwrap_or_default(),
+        map_frame: map_frame.flatten(),
         ..Checkpoint::of(snapshot, meta.seed, meta.steps)
     })
 }

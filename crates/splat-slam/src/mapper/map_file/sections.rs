@@ -11,6 +11,7 @@ use crate::mapper::splats::region_codec::{
 };
 use crate::mapper::splats::regions::Evicted;
 use splat_types::camera::Intrinsics;
+use splat_types::map_frame::MapFrame;
 use splat_types::snapshot::KeyframePose;
 use splat_types::splats::layout;
 use splat_types::splats::splats::Splats;
@@ -22,6 +23,42 @@ const KEYFRAME_BYTES: usize = 4 + 8 + 4 * 8 + 3 * 8 + 2 * 4 + 4 * 8;
 /// Bytes before a view's image: id, flags, length.
 const VIEW_HEAD_BYTES: u64 = 12;
 const IS_HELD_OUT: u32 = 1;
+
+/// Empty where there is none.
+pub(crate) fn map_frame_bytes(frame: Option<MapFrame>) -> Vec<u8> {
+    let poses = frame.map(|frame| [frame.world_from_cam, frame.map_from_cam]);
+    let numbers = poses.into_iter().flatten().flat_map(|pose| {
+        let (q, t) = (pose.rotation, pose.translation);
+        [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
+    });
+    numbers.flat_map(f64::to_le_bytes).collect()
+}
+
+pub(crate) fn parse_map_frame(mut content: &[u8]) -> Result<Option<MapFrame>, String> {
+    if content.is_empty() {
+        return Ok(None);
+    }
+    let found = content.len();
+    let mut numbers = [0.0; 14];
+    let read = content.read_f64_into::<LittleEndian>(&mut numbers);
+    if read.is_err() || !content.is_empty() {
+        return Err(format!("{found} bytes, two poses have 112"));
+    }
+    let pose = |n: &[f64]| {
+        let rotation = DQuat::from_xyzw(n[1], n[2], n[3], n[0]);
+        Rigid::new(rotation, DVec3::new(n[4], n[5], n[6]))
+    };
+    let frame = MapFrame {
+        world_from_cam: pose(&numbers[..7]),
+        map_from_cam: pose(&numbers[7..]),
+    };
+    let is_sound = |pose: &Rigid| pose.is_finite() && (pose.rotation.length() - 1.0).abs() < 1e-6;
+    if is_sound(&frame.world_from_cam) && is_sound(&frame.map_from_cam) {
+        Ok(Some(frame))
+    } else {
+        Err("its poses are none".to_owned())
+    }
+}
 
 pub(crate) fn keyframe_bytes(poses: &[KeyframePose]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(poses.len() * KEYFRAME_BYTES);

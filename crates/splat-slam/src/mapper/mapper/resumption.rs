@@ -61,6 +61,7 @@ impl Mapper {
             None => 0,
         };
         self.scale.set(snapshot.scale);
+        self.map_frame = saved.map_frame;
         let splats = in_degree(&snapshot.splats, self.params.train.sh_degree);
         self.splats.set_resumed(splats.len());
         let prior = PriorMap {

@@ -36,7 +36,10 @@ impl Mapper {
     /// packed when the file is written. `landmarks` are the tracker's.
     pub fn checkpoint(&self, landmarks: Vec<u8>) -> Checkpoint {
         let snapshot = Snapshot::clone(&self.last_snapshot());
-        let bare = Checkpoint::of(snapshot, self.seed, self.n_steps_in_all());
+        let bare = Checkpoint {
+            map_frame: self.map_frame,
+            ..Checkpoint::of(snapshot, self.seed, self.n_steps_in_all())
+        };
         let Some(good) = &self.last_good else {
             return bare;
         };
