@@ -1,5 +1,5 @@
 //! Plans a way for a round robot on the map of a running mapper, over zenoh, as any client can: A* on `distance_slice`, shortened, and checked in space by
-//! `get_distances`.
+//! `get_distances` and against the splats by `get_ellipsoids`. The way goes out as nav_msgs/Path on /plan, where the mapper's viewer draws it.
 #![allow(clippy::print_stdout, reason = "an example speaks to the terminal")]
 
 use std::collections::{BTreeMap, BinaryHeap};
@@ -8,21 +8,32 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Parser;
-use glam::{DVec2, IVec2};
+use glam::{DQuat, DVec2, DVec3, IVec2};
 use image::{Rgb, RgbImage};
 use zenoh::query::ConsolidationMode;
 use zenoh::{Config, Session, Wait};
 
-use splat_msgs::ros;
+use splat_msgs::ellipsoid_message::EllipsoidArray;
+use splat_msgs::map_messages::payload;
 use splat_msgs::ros::navigation::DistanceMapSlice;
+use splat_msgs::ros::standard::Path as NavPath;
+use splat_msgs::ros::{self, Message, PoseStamped};
 use splat_msgs::services::SERVICES;
-use splat_msgs::type_hash::{dds_name, service_hash};
+use splat_msgs::type_hash::{dds_name, service_hash, type_hash};
+use splat_ros::box_services::{BoxRequest, GetEllipsoidsResponse};
 use splat_ros::distances::{GetDistancesRequest, GetDistancesResponse};
+use splat_types::transform::Rigid;
+use splat_volume::ellipsoids::Ellipsoid;
 
 /// Steps in which a way is checked, metres.
 const STEP: f64 = 0.025;
+/// Splats are asked for so far beside the robot, metres: their middles may be farther away than their ends.
+const REACH: f64 = 0.3;
 /// Heights above and below the slice's, metres.
 const HEIGHTS: [f64; 5] = [-0.5, -0.25, 0.0, 0.25, 0.5];
+/// Each cuts corners once more.
+const SMOOTHINGS: usize = 3;
+const MAX_PLANS: usize = 50;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Plans a way on the map of a running mapper.
@@ -43,9 +54,19 @@ struct Args {
     /// Of the robot, metres.
     #[arg(long, default_value_t = 0.2)]
     radius: f64,
+    /// Standard deviations that a splat reaches: Splat-Nav and SAFER-Splat take one.
+    #[arg(long, default_value_t = 1.0)]
+    sigma: f64,
     /// Draws the slice and the way.
     #[arg(long, value_name = "FILE.png")]
     out: Option<PathBuf>,
+}
+
+impl Args {
+    /// Metres that a way is to have to all sides: the radius, but for what cells leave open.
+    fn wanted(&self, slice: &Slice) -> f64 {
+        self.radius - f64::from(slice.0.resolution)
+    }
 }
 
 /// The slice, and what it is asked.
@@ -141,6 +162,40 @@ impl Slice {
             kept.push(ahead.unwrap_or(at + 1));
         }
         kept.into_iter().map(|at| points[at]).collect()
+    }
+
+    /// Cells that a way does not go through from now on, so many metres around a place.
+    fn block(&mut self, place: DVec2, by: f64) {
+        let (width, cell) = (self.0.width as i32, self.cell(place));
+        let reach = (by / f64::from(self.0.resolution)).ceil().max(1.0) as i32;
+        for (x, y) in (-reach..=reach).flat_map(|x| (-reach..=reach).map(move |y| (x, y))) {
+            let at = cell + IVec2::new(x, y);
+            if x * x + y * y <= reach * reach && self.room(at).is_some() {
+                self.0.data[(at.y * width + at.x) as usize] = 0.0;
+            }
+        }
+    }
+
+    /// With its corners cut (Chaikin 1974) wherever there is room for that.
+    fn smoothed(&self, way: &[DVec2], radius: f64) -> Vec<DVec2> {
+        let mut way = way.to_vec();
+        for _ in 0..SMOOTHINGS {
+            let mut cut: Vec<DVec2> = way.first().copied().into_iter().collect();
+            for corner in way.windows(3) {
+                let [before, at, behind] = corner else {
+                    continue;
+                };
+                let (enter, leave) = (at.lerp(*before, 0.25), at.lerp(*behind, 0.25));
+                if self.is_line_free(enter, leave, radius) {
+                    cut.extend([enter, leave]);
+                } else {
+                    cut.push(*at);
+                }
+            }
+            cut.extend(way.last());
+            way = cut;
+        }
+        way
     }
 
     fn draw(&self, way: &[DVec2], path: &Path) -> Result<()> {
@@ -256,6 +311,160 @@ fn checked(
     Ok((least, n_unknown, answer.known.len()))
 }
 
+/// What splats leave of a way, at all heights.
+struct AmongSplats {
+    /// Metres.
+    least: f64,
+    n: usize,
+    /// Where it is too narrow, and by how much.
+    narrow: Vec<(DVec2, f64)>,
+}
+
+fn among_splats(
+    session: &Session,
+    args: &Args,
+    slice: &Slice,
+    way: &[DVec2],
+) -> Result<AmongSplats> {
+    let mut found = AmongSplats {
+        least: f64::INFINITY,
+        n: 0,
+        narrow: Vec::new(),
+    };
+    let wanted = args.wanted(slice);
+    let points: Vec<DVec2> = points_of(way).collect();
+    // Boxes along the way: one around all of it may hold too many.
+    for part in points.chunks(40) {
+        let ellipsoids = ellipsoids_beside(session, args, slice, part)?;
+        found.n += ellipsoids.len();
+        for place in part {
+            let mut least = f64::INFINITY;
+            for at in HEIGHTS.map(|above| place.extend(slice.0.origin.z + above)) {
+                for ellipsoid in &ellipsoids {
+                    let reach = ellipsoid.semi_axes.max_element();
+                    if at.distance(ellipsoid.mean) - reach < least {
+                        least = least.min(ellipsoid.distance(at));
+                    }
+                }
+            }
+            found.least = found.least.min(least);
+            if least < wanted {
+                found.narrow.push((*place, wanted - least));
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Splats around points of a way.
+fn ellipsoids_beside(
+    session: &Session,
+    args: &Args,
+    slice: &Slice,
+    part: &[DVec2],
+) -> Result<Vec<Ellipsoid>> {
+    let key = service_key(args, "get_ellipsoids").context("there is no such service")?;
+    let ends = |pick: fn(DVec2, DVec2) -> DVec2| part.iter().copied().reduce(pick);
+    let (Some(low), Some(high)) = (ends(DVec2::min), ends(DVec2::max)) else {
+        return Ok(Vec::new());
+    };
+    let margin = args.radius + REACH;
+    let (bottom, top) = (HEIGHTS[0] - margin, HEIGHTS[HEIGHTS.len() - 1] + margin);
+    let corner = |xy: DVec2, z: f64| xy.extend(slice.0.origin.z + z).as_vec3().to_array();
+    let question = BoxRequest {
+        frame_id: slice.0.header.frame_id.clone(),
+        low: corner(low - margin, bottom),
+        high: corner(high + margin, top),
+    };
+    let answers = ask(session, &key, ros::encode_plain(&question)?)?;
+    let answer = answers.first().context("get_ellipsoids does not answer")?;
+    let answer: GetEllipsoidsResponse = ros::decode_plain(answer)?;
+    if !answer.success {
+        bail!("get_ellipsoids: {}", answer.message);
+    }
+    if answer.ellipsoids.n_left_out > 0 {
+        bail!("more splats beside the way than one answer holds: take a smaller radius");
+    }
+    ellipsoids_of(&answer.ellipsoids, args.sigma)
+}
+
+fn ellipsoids_of(array: &EllipsoidArray, sigma: f64) -> Result<Vec<Ellipsoid>> {
+    let n = array.ids.len();
+    let share = sigma / f64::from(array.k_sigma);
+    let triples = |values: &[f32], name: &str| -> Result<Vec<DVec3>> {
+        let (triples, rest) = values.as_chunks::<3>();
+        if triples.len() != n || !rest.is_empty() {
+            bail!("{} numbers of {name} for {n} ellipsoids", values.len());
+        }
+        let of = |t: &[f32; 3]| DVec3::from_array(t.map(f64::from));
+        Ok(triples.iter().map(of).collect())
+    };
+    let (means, axes) = (
+        triples(&array.means, "means")?,
+        triples(&array.semi_axes, "semi_axes")?,
+    );
+    let (rotations, _) = array.rotations.as_chunks::<4>();
+    let all = means.into_iter().zip(axes).zip(rotations).zip(&array.ids);
+    Ok(all
+        .map(|(((mean, semi_axes), q), id)| Ellipsoid {
+            splat_id: *id,
+            mean,
+            rotation: DQuat::from_array(q.map(f64::from)).normalize(),
+            semi_axes: semi_axes * share,
+            opacity: 1.0,
+            observations: 0,
+            last_keyframe: 0,
+            position_sigma: 0.0,
+        })
+        .collect())
+}
+
+/// A way that is clear on the slice and among the splats: where those leave too little room, it is planned anew around that place.
+fn plan(
+    session: &Session,
+    args: &Args,
+    slice: &mut Slice,
+    [from, to]: [IVec2; 2],
+) -> Result<(Vec<DVec2>, AmongSplats)> {
+    for _ in 0..MAX_PLANS {
+        let Some(way) = slice.way(from, to, args.radius) else {
+            bail!(
+                "no way: what is known and free between the two places is narrower than the robot"
+            );
+        };
+        let way = slice.smoothed(&slice.shortened(&way, args.radius), args.radius);
+        let found = among_splats(session, args, slice, &way)?;
+        if found.narrow.is_empty() {
+            return Ok((way, found));
+        }
+        for (place, by) in &found.narrow {
+            slice.block(*place, *by);
+        }
+    }
+    bail!("no way: wherever the slice has room, splats reach into it");
+}
+
+/// As Nav2's planners publish theirs.
+fn publish(session: &Session, args: &Args, slice: &Slice, way: &[DVec2]) -> Result<()> {
+    let header = slice.0.header.clone();
+    let pose = |p: DVec2| PoseStamped {
+        header: header.clone(),
+        pose: Rigid::new(DQuat::IDENTITY, p.extend(0.0)).into(),
+    };
+    let path = NavPath {
+        poses: points_of(way).step_by(4).map(pose).collect(),
+        header: header.clone(),
+    };
+    let key = format!(
+        "{}/plan/{}/{}",
+        args.domain,
+        dds_name(NavPath::TYPE_NAME),
+        type_hash::<NavPath>()
+    );
+    let sent = session.put(&key, payload(&path)?).wait();
+    sent.map_err(|e| anyhow!("{key}: {e}"))
+}
+
 fn main() -> Result<()> {
     let args = Args::parse();
     let ([from_x, from_y], [to_x, to_y]) = (args.from[..].try_into()?, args.to[..].try_into()?);
@@ -265,7 +474,7 @@ fn main() -> Result<()> {
     let slice = slices
         .last()
         .context("no distance_slice yet: is the mapper running, and is its scale known?")?;
-    let slice = Slice(ros::decode::<DistanceMapSlice>(slice)?);
+    let mut slice = Slice(ros::decode::<DistanceMapSlice>(slice)?);
     let ends = [DVec2::new(from_x, from_y), DVec2::new(to_x, to_y)].map(|end| slice.cell(end));
     for (name, end) in ["--from", "--to"].into_iter().zip(ends) {
         if slice.is_free(end, args.radius) {
@@ -283,25 +492,26 @@ fn main() -> Result<()> {
             near.y
         );
     }
-    let [from, to] = ends;
-    let Some(way) = slice.way(from, to, args.radius) else {
-        bail!("no way: what is known and free between the two places is narrower than the robot");
-    };
-    let way = slice.shortened(&way, args.radius);
+    let (way, splats) = plan(&session, &args, &mut slice, ends)?;
     for point in &way {
         println!("{:.3} {:.3}", point.x, point.y);
     }
     let length: f64 = way.windows(2).map(|pair| pair[0].distance(pair[1])).sum();
     let (least, n_unknown, n) = checked(&session, &args, &slice, &way)?;
     println!(
-        "{length:.2} m in {}, {} corners; in space the nearest surface is {least:.2} m away, {n_unknown} of {n} points are unseen",
+        "{length:.2} m in {}, {} points; in space the nearest surface is {least:.2} m away, {n_unknown} of {n} points are unseen",
         slice.0.header.frame_id,
-        way.len().saturating_sub(2)
+        way.len()
     );
+    println!(
+        "the nearest of {} splats beside it, at {} sigma, is {:.2} m away",
+        splats.n, args.sigma, splats.least
+    );
+    publish(&session, &args, &slice, &way)?;
     if let Some(out) = &args.out {
         slice.draw(&way, out)?;
     }
-    if f64::from(least) < args.radius - f64::from(slice.0.resolution) {
+    if f64::from(least) < args.wanted(&slice) {
         bail!("the way is not clear of obstacles at all heights");
     }
     Ok(())

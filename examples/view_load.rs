@@ -163,6 +163,7 @@ fn main() -> Result<()> {
         sh_degree: 3,
         source: "live",
         title: "random changes".to_owned(),
+        map_frame: "map".to_owned(),
     })?;
     println!("{}", viewer.url());
     let mut world = World::new(args.splats);

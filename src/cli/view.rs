@@ -20,6 +20,7 @@ use crate::view::viewer::{self, DEFAULT_ADDRESS, Shown};
 use splat_io::messages;
 #[cfg(feature = "zenoh")]
 use splat_msgs::map_messages::SplatManifest;
+use splat_msgs::ros::{self, Message as _};
 use splat_msgs::type_hash::dds_name;
 #[cfg(feature = "zenoh")]
 use splat_msgs::type_hash::dds_type_name;
@@ -79,7 +80,11 @@ fn play(path: &str, params: &Params, stop: &Stop) -> anyhow::Result<()> {
     let mut map = FollowedMap::new(Arc::clone(viewer.hub()), &params.publish);
     let n = messages::read(Path::new(path), |message| {
         // Names of types are `package/msg/Name`; others are none of ours.
-        if message.type_name.split('/').count() == 3 {
+        if message.type_name == ros::standard::Path::TYPE_NAME
+            && message.topic == params.publish.plan_topic
+        {
+            map.take_plan(message.payload);
+        } else if message.type_name.split('/').count() == 3 {
             map.take(&dds_name(message.type_name), message.payload);
         }
         !stop.is_asked()
@@ -139,7 +144,11 @@ fn follow(endpoint: &str, settings: &mut Settings, stop: &Stop) -> anyhow::Resul
                 gid = message.gid;
                 map.restart();
             }
-            is_whole_wanted |= map.take(&message.dds_type, &message.payload);
+            if message.is_plan {
+                map.take_plan(&message.payload);
+            } else {
+                is_whole_wanted |= map.take(&message.dds_type, &message.payload);
+            }
         }
         is_whole_wanted |= !map.has_map() && since_asked.secs() > SECS_BETWEEN_QUERIES;
     }

@@ -17,13 +17,13 @@ use splat_ros::odometry::saved_map_frame;
 use splat_slam::mapper::map_file::checkpoint::Checkpoint;
 use splat_types::snapshot::KeyframePose;
 use splat_types::transform::Similarity;
+use splat_volume::blocks::SIDE;
 use splat_volume::grid::{FREE, Grid, OCCUPIED, grid};
 use splat_volume::map_file;
 use splat_volume::mesh::{Mesh, mesh};
 use splat_volume::mesh_colour::colours;
 use splat_volume::params::GridParams;
 use splat_volume::volume::{KeyframeDepth, Volume};
-use splat_volume::voxels::SIDE;
 
 /// Voxels of a volume that is written as one array: 512 MiB.
 const MAX_VOXELS: u64 = 1 << 27;

@@ -1,9 +1,11 @@
 //! Keyframes with their depth -> grids for planners. Nobody waits for it: of snapshots that come too fast, the newest counts.
 
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::node::page_file::PageFile;
 use crate::node::rate_limited::RateLimitedLog;
 use splat_io::queue::Receiver;
 use splat_ros::grid_stream::{GridStream, LevelGrid};
@@ -19,11 +21,43 @@ use splat_volume::volume::{KeyframeDepth, Volume};
 
 /// Keyframes that are fused between looks at whether there are newer ones.
 const KEYFRAMES_AT_ONCE: usize = 8;
+/// Grids of a large map take longer: they may take this share of the time.
+const GRID_SHARE: f64 = 0.2;
 /// Ellipsoids and voxels go out every so many seconds, and seldomer where they take more than this share of the time.
 const OBSTACLES_SECS: f64 = 2.0;
 const OBSTACLES_SHARE: f64 = 0.05;
 /// They lie within so many times the range of depth of the newest keyframe.
 const OBSTACLES_REACH: f64 = 2.0;
+
+/// When something is done again: after a while, and seldom enough that it takes no more than its share of the time.
+#[derive(Debug)]
+struct Pace {
+    period: f64,
+    share: f64,
+    since: Option<Stopwatch>,
+    /// Seconds that it took.
+    took: f64,
+}
+
+impl Pace {
+    fn new(period: f64, share: f64) -> Self {
+        Self {
+            period,
+            share,
+            since: None,
+            took: 0.0,
+        }
+    }
+
+    fn is_due(&self) -> bool {
+        let wanted = self.period.max(self.took / self.share);
+        self.since.is_none_or(|watch| watch.secs() >= wanted)
+    }
+
+    fn done(&mut self, took: f64) {
+        (self.since, self.took) = (Some(Stopwatch::start()), took);
+    }
+}
 
 /// All keyframes as a snapshot has them.
 #[derive(Debug, Clone)]
@@ -37,29 +71,35 @@ pub(crate) struct GridInput {
 pub(crate) struct GridStage {
     params: GridParams,
     volume: Volume,
+    folder: Option<PathBuf>,
     map_id: Option<[u8; 16]>,
     publisher: Arc<Publisher>,
     stream: GridStream,
     pool: Option<rayon::ThreadPool>,
-    since_grid: Option<Stopwatch>,
-    since_obstacles: Option<Stopwatch>,
-    /// Least time between two messages of obstacles, seconds.
-    obstacles_period: f64,
+    grids: Pace,
+    obstacles: Pace,
     rate_limited: RateLimitedLog,
 }
 
 impl GridStage {
-    pub(crate) fn new(params: &GridParams, publisher: &Arc<Publisher>, stream: GridStream) -> Self {
+    /// `folder`: of the run, where far parts of the volume go when memory is short.
+    pub(crate) fn new(
+        params: &GridParams,
+        folder: Option<&Path>,
+        publisher: &Arc<Publisher>,
+        stream: GridStream,
+    ) -> Self {
+        let folder = folder.map(Path::to_owned);
         Self {
             params: params.clone(),
-            volume: Volume::new(params),
+            volume: empty_volume(params, folder.as_deref()),
+            folder,
             map_id: None,
             publisher: Arc::clone(publisher),
             stream,
             pool: None,
-            since_grid: None,
-            since_obstacles: None,
-            obstacles_period: OBSTACLES_SECS,
+            grids: Pace::new(params.period, GRID_SHARE),
+            obstacles: Pace::new(OBSTACLES_SECS, OBSTACLES_SHARE),
             rate_limited: RateLimitedLog::default(),
         }
     }
@@ -78,7 +118,7 @@ impl GridStage {
             return self.stream.report(reason);
         }
         if self.map_id != Some(input.snapshot.map_id) {
-            self.volume = Volume::new(&self.params);
+            self.volume = empty_volume(&self.params, self.folder.as_deref());
             self.map_id = Some(input.snapshot.map_id);
         }
         let keyframes = keyframes_of(&input.keyframes, &self.stream.map_from_world(metres));
@@ -95,15 +135,17 @@ impl GridStage {
                 break;
             }
         }
-        let is_due = self
-            .since_grid
-            .is_none_or(|watch| watch.secs() >= self.params.period);
-        if is_due || input.is_last {
-            self.send(input, &keyframes);
+        if self.grids.is_due() || input.is_last {
+            let watch = Stopwatch::start();
+            let is_sent = self.send(input, &keyframes);
+            if is_sent {
+                self.grids.done(watch.secs());
+            }
         }
     }
 
-    fn send(&mut self, input: &GridInput, keyframes: &[KeyframeDepth]) {
+    /// `false`: there is no grid.
+    fn send(&mut self, input: &GridInput, keyframes: &[KeyframeDepth]) -> bool {
         let snapshot = &input.snapshot;
         self.stream
             .keep_volume(&self.publisher, &self.volume, snapshot);
@@ -113,9 +155,9 @@ impl GridStage {
         self.send_obstacles(input, newest);
         let Some(ground) = self.volume.ground() else {
             let reason = "no ground was seen: a plane below the camera that leans by less than 25 degrees from level";
-            return self.stream.report(reason);
+            self.stream.report(reason);
+            return false;
         };
-        self.since_grid = Some(Stopwatch::start());
         tracing::debug!(
             "grid: {} keyframes, {:.1} MiB, ground at {:.2} m with {:.0} % of the points",
             self.volume.n_keyframes(),
@@ -128,7 +170,7 @@ impl GridStage {
         let focus = (newest / resolution).floor().truncate().as_ivec2();
         let before = self.stream.extent();
         let Some(grid) = grid(&mut self.volume, before, focus) else {
-            return;
+            return false;
         };
         let params = &self.params;
         let level_grid = LevelGrid {
@@ -142,13 +184,12 @@ impl GridStage {
             self.rate_limited
                 .warn(format_args!("a grid did not go out: {e}"));
         }
+        true
     }
 
     /// What lies around the newest keyframe.
     fn send_obstacles(&mut self, input: &GridInput, newest: DVec3) {
-        let since = self.since_obstacles.as_ref();
-        let is_due = since.is_none_or(|watch| watch.secs() >= self.obstacles_period);
-        if !is_due && !input.is_last {
+        if !self.obstacles.is_due() && !input.is_last {
             return;
         }
         let watch = Stopwatch::start();
@@ -164,9 +205,8 @@ impl GridStage {
             let text = format_args!("ellipsoids and voxels did not go out: {e}");
             self.rate_limited.warn(text);
         }
-        self.obstacles_period = OBSTACLES_SECS.max(watch.secs() / OBSTACLES_SHARE);
         tracing::debug!("obstacles took {:.1} ms", 1e3 * watch.secs());
-        self.since_obstacles = Some(Stopwatch::start());
+        self.obstacles.done(watch.secs());
     }
 
     fn warn_of(&mut self, faults: &[VolumeError]) {
@@ -175,6 +215,11 @@ impl GridStage {
             self.rate_limited.warn(text);
         }
     }
+}
+
+fn empty_volume(params: &GridParams, folder: Option<&Path>) -> Volume {
+    let pages = PageFile::new(folder, params.max_page_file_mib << 20);
+    Volume::new(params).paging_to(Box::new(pages))
 }
 
 /// `map_from_world` has metres a unit for its scale.

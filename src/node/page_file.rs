@@ -8,7 +8,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
-use splat_slam::mapper::pages::{Page, PageStore};
+use splat_types::pages::{Page, PageStore};
 
 /// A file with room for `max_bytes` of records, created when the first record comes.
 #[derive(Debug)]

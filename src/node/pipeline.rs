@@ -105,9 +105,10 @@ fn run_with(
     }
     let (handles, streams) = job.output.map(|out| (out.handles, out.streams)).unzip();
     let publisher = handles.as_ref().map(|handles| &handles.publisher);
-    let output = publisher
-        .zip(streams)
-        .map(|(publisher, streams)| stages_of(publisher, streams, &job.params.grid));
+    let output = publisher.zip(streams).map(|(publisher, streams)| {
+        let grid = (&job.params.grid, job.out.as_deref());
+        stages_of(publisher, streams, grid)
+    });
     let stages = Stages {
         map,
         select: SelectStage::new(&job.params, first_id, handles.as_ref())

@@ -1,5 +1,6 @@
 //! Events of the stages -> the publisher: poses and status on one thread, snapshots on another.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -111,11 +112,11 @@ pub(crate) struct OutputStages {
     pub(crate) grid: GridStage,
 }
 
-/// Who publishes what; `streams_of` takes it apart again.
+/// Who publishes what; `streams_of` takes it apart again. `folder`: where far parts of the volume may go.
 pub(crate) fn stages_of(
     publisher: &Arc<Publisher>,
     streams: Streams,
-    grid: &GridParams,
+    (grid, folder): (&GridParams, Option<&Path>),
 ) -> OutputStages {
     let live = LiveStage {
         publisher: Arc::clone(publisher),
@@ -131,7 +132,7 @@ pub(crate) fn stages_of(
     OutputStages {
         live,
         snapshots,
-        grid: GridStage::new(grid, publisher, streams.grid),
+        grid: GridStage::new(grid, folder, publisher, streams.grid),
     }
 }
 

@@ -3,19 +3,23 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use crate::view::followed_grid::FollowedGrid;
 use splat_msgs::client::follower::{Followed, Follower};
 use splat_msgs::correction_message::MapCorrectionMsg;
 use splat_msgs::map_messages::{KeyframeArray, SplatManifest};
+use splat_msgs::ros::navigation::{OccupancyGrid, OccupancyGridUpdate};
 use splat_msgs::ros::standard::PoseWithCovarianceStamped;
 use splat_msgs::ros::{self, TfMessage};
 use splat_msgs::status_message::MapperStatus;
 use splat_msgs::type_hash::dds_type_name;
 use splat_ros::odometry::{forward_camera, parse_transform};
 use splat_ros::params::PublishParams;
+use splat_ros::plan::Plan;
 use splat_types::snapshot::KeyframePose;
 use splat_types::tracking::{TrackState, TrackedFrame, TrackedPose};
 use splat_types::transform::{Rigid, Similarity};
 use splat_view::hub::Hub;
+use splat_view::plan_frames::PlanFrames;
 use splat_view::view_map::Published;
 
 /// Of a map that is followed.
@@ -34,6 +38,9 @@ pub struct FollowedMap {
     poses: BTreeMap<u32, KeyframePose>,
     map_id: [u8; 16],
     state: TrackState,
+    grid: FollowedGrid,
+    plan_frames: PlanFrames,
+    newest_pose: Option<PoseWithCovarianceStamped>,
 }
 
 impl FollowedMap {
@@ -51,6 +58,9 @@ impl FollowedMap {
             poses: BTreeMap::new(),
             map_id: [0; 16],
             state: TrackState::Initialising,
+            grid: FollowedGrid::new(&params.map_frame),
+            plan_frames: PlanFrames::new(&params.map_frame),
+            newest_pose: None,
         }
     }
 
@@ -73,6 +83,16 @@ impl FollowedMap {
             self.take_pose(payload);
         } else if is(dds_type_name::<MapperStatus>()) {
             self.take_status(payload);
+        } else if is(dds_type_name::<OccupancyGrid>()) {
+            if let Ok(grid) = ros::decode(payload) {
+                self.grid.take(&grid);
+                self.grid.show(&self.hub, &mut self.plan_frames);
+            }
+        } else if is(dds_type_name::<OccupancyGridUpdate>()) {
+            if let Ok(update) = ros::decode(payload) {
+                self.grid.update(&update);
+                self.grid.show(&self.hub, &mut self.plan_frames);
+            }
         } else if is(dds_type_name::<MapCorrectionMsg>()) {
             if let Some(correction) = ros::decode::<MapCorrectionMsg>(payload)
                 .ok()
@@ -98,6 +118,14 @@ impl FollowedMap {
         false
     }
 
+    /// Where a planner means to go.
+    pub fn take_plan(&mut self, payload: &[u8]) {
+        let plan = Plan::read(payload);
+        if let Some(points) = plan.and_then(|plan| self.plan_frames.in_map(&plan)) {
+            self.hub.plan(&points);
+        }
+    }
+
     fn show(&mut self) {
         let Some(held) = self.follower.held() else {
             return;
@@ -115,6 +143,14 @@ impl FollowedMap {
             snapshot: Arc::new(snapshot),
             map_from_world: self.map_from_world,
         });
+        self.show_newest_pose();
+    }
+
+    /// Where the splats lie, and their unit, may come behind the pose.
+    fn show_newest_pose(&self) {
+        if let Some(pose) = &self.newest_pose {
+            self.show_pose(pose);
+        }
     }
 
     fn take_keyframes(&mut self, payload: &[u8]) {
@@ -137,20 +173,29 @@ impl FollowedMap {
         let Ok(message) = ros::decode::<TfMessage>(payload) else {
             return;
         };
+        self.grid.take_transforms(&message);
         let of_splats = message.transforms.iter().find(|link| {
             link.child_frame_id == self.splat_frame && link.header.frame_id == self.map_frame
         });
         if let Some(found) = of_splats.and_then(|link| link.transform.to_rigid()) {
             self.map_from_world.rotation = found.rotation;
+            let is_new = self.map_from_world.translation != found.translation;
             self.map_from_world.translation = found.translation;
+            if is_new {
+                self.show_newest_pose();
+            }
         }
     }
 
     /// The robot in the map frame -> the camera among the splats.
     fn take_pose(&mut self, payload: &[u8]) {
-        let Ok(message) = ros::decode::<PoseWithCovarianceStamped>(payload) else {
-            return;
-        };
+        if let Ok(message) = ros::decode::<PoseWithCovarianceStamped>(payload) {
+            self.show_pose(&message);
+            self.newest_pose = Some(message);
+        }
+    }
+
+    fn show_pose(&self, message: &PoseWithCovarianceStamped) {
         let Some(map_from_base) = message.pose.pose.to_rigid() else {
             return;
         };
@@ -161,7 +206,7 @@ impl FollowedMap {
                 world_from_map.rotation * cam_in_map.rotation,
                 world_from_map.transform_point(cam_in_map.translation),
             ),
-            covariance: self.covariance_of(&message, &cam_in_map),
+            covariance: self.covariance_of(message, &cam_in_map),
             is_predicted: false,
         };
         self.hub.frame(&TrackedFrame {

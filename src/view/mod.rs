@@ -4,4 +4,6 @@ pub mod viewer;
 
 pub mod saved;
 
+pub mod followed_grid;
+
 pub mod followed;

@@ -59,6 +59,7 @@ pub fn settings(
             Shown::Recording => "recording",
         },
         title: title.to_owned(),
+        map_frame: params.map_frame.clone(),
     }))
 }
 

@@ -229,8 +229,9 @@ fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
     for map in [&map, &truth] {
         let volume = planner_map::volume(map, &GridParams::default()).unwrap();
         let ground = volume.ground().unwrap();
-        // The first camera's height above the floor.
-        let height = take().pose(0).translation.z;
+        // Above the floor, of the camera where the map frame begins.
+        let frame = map.map_frame.unwrap();
+        let height = frame.world_from_cam.translation.z;
         assert!(
             (ground.height + height).abs() < 0.02,
             "{ground:?}, {height}"

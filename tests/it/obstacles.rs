@@ -12,10 +12,11 @@ use splat_msgs::ros;
 use splat_msgs::ros::navigation::OccupancyGrid;
 use splat_msgs::ros::standard::PointCloud2;
 use splat_slam::mapper::map_file::checkpoint;
+use splat_volume::blocks::SIDE;
 use splat_volume::ellipsoids::Ellipsoid;
 use splat_volume::grid::{Grid, UNKNOWN};
 use splat_volume::params::GridParams;
-use splat_volume::voxels::{SIDE, State, Voxels};
+use splat_volume::voxels::{State, Voxels};
 
 fn vector(values: &[f32], ix: usize) -> DVec3 {
     DVec3::new(
@@ -43,8 +44,9 @@ fn ellipsoid(array: &EllipsoidArray, ix: usize) -> Ellipsoid {
 fn surface(voxels: &Voxels) -> Vec<DVec3> {
     let mut found = Vec::new();
     for block in voxels.indices() {
+        let view = voxels.block(block).unwrap();
         for (x, y) in (0..SIDE).flat_map(|x| (0..SIDE).map(move |y| (x, y))) {
-            let states = voxels.states(block, x, y).into_iter().flatten();
+            let states = view.states(x, y).into_iter();
             let surface = states.enumerate().filter(|(_, s)| *s == State::Surface);
             let at = |(z, _)| block * SIDE + IVec3::new(x, y, z as i32);
             found.extend(surface.map(at).map(|v| (v.as_dvec3() + 0.5) * voxels.size));
@@ -119,7 +121,11 @@ fn ellipsoids_and_voxels_of_a_room_are_where_the_room_is() {
         near_surface.len()
     );
     let cloud = messages(&sent, "voxels").pop().unwrap();
-    let cloud: PointCloud2 = ros::decode(&cloud).unwrap();
+    check_voxels(&ros::decode(&cloud).unwrap(), &surface, truth.size);
+}
+
+/// Nearly all lie where a surface is, or beside it.
+fn check_voxels(cloud: &PointCloud2, surface: &[DVec3], voxel: f64) {
     assert_eq!(cloud.data.len(), (cloud.width * cloud.point_step) as usize);
     let points: Vec<DVec3> = cloud
         .data
@@ -133,7 +139,7 @@ fn ellipsoids_and_voxels_of_a_room_are_where_the_room_is() {
             )
         })
         .collect();
-    let voxel_of = |p: &DVec3| (*p / truth.size).floor().as_ivec3();
+    let voxel_of = |p: &DVec3| (*p / voxel).floor().as_ivec3();
     let wanted: HashSet<IVec3> = surface.iter().map(voxel_of).collect();
     let is_near = |p: &&DVec3| {
         let at = voxel_of(p);

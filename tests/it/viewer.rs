@@ -11,9 +11,12 @@ use crate::view_client::ViewClient;
 use splat_mapper::view::followed::FollowedMap;
 use splat_msgs::correction_message;
 use splat_msgs::map_messages::payload;
+use splat_msgs::ros::navigation::{OccupancyGrid, OccupancyGridUpdate};
 use splat_msgs::ros::odometry::PoseWithCovariance;
-use splat_msgs::ros::standard::PoseWithCovarianceStamped;
+use splat_msgs::ros::standard::{self, PoseWithCovarianceStamped};
+use splat_msgs::ros::{Header, PoseStamped, TfMessage, TransformStamped};
 use splat_msgs::type_hash::dds_type_name;
+use splat_ros::odometry::forward_camera;
 use splat_ros::params::PublishParams;
 use splat_ros::transport::{Event, Transport};
 use splat_types::correction::{MapCorrection, Reason};
@@ -35,6 +38,7 @@ pub fn settings() -> ViewSettings {
         sh_degree: 1,
         source: "live",
         title: "test".to_owned(),
+        map_frame: "map".to_owned(),
     }
 }
 
@@ -258,8 +262,8 @@ fn a_mapper_elsewhere_is_shown_as_its_messages_say() {
         },
         ..PoseWithCovarianceStamped::default()
     };
-    let payload = payload(&message).unwrap();
-    followed.take(&dds_type_name::<PoseWithCovarianceStamped>(), &payload);
+    let sent = payload(&message).unwrap();
+    followed.take(&dds_type_name::<PoseWithCovarianceStamped>(), &sent);
     while client.events.is_empty() {
         client.take();
     }
@@ -270,6 +274,102 @@ fn a_mapper_elsewhere_is_shown_as_its_messages_say() {
         "{pose}"
     );
     assert!((number(3).abs() - 1.0).abs() < 1e-9, "{pose}");
+    // Where the splats lie is said behind the pose: it counts for it all the same.
+    let transform = TfMessage {
+        transforms: vec![TransformStamped {
+            header: header("map"),
+            child_frame_id: "splat_map".to_owned(),
+            transform: Rigid::new(forward_camera().rotation, glam::DVec3::new(0.25, 0.0, 0.0))
+                .into(),
+        }],
+    };
+    client.events.clear();
+    let sent = payload(&transform).unwrap();
+    followed.take(&dds_type_name::<TfMessage>(), &sent);
+    while client.events.is_empty() {
+        client.take();
+    }
+    let ahead = client.events[0]["pose"][6].as_f64().unwrap();
+    assert!((ahead - 0.75).abs() < 1e-9, "{ahead}");
+}
+
+fn header(frame: &str) -> Header {
+    Header {
+        frame_id: frame.to_owned(),
+        ..Header::default()
+    }
+}
+
+#[test]
+fn grids_and_plans_of_a_mapper_elsewhere_are_shown() {
+    let viewer = started();
+    let mut followed = FollowedMap::new(Arc::clone(viewer.hub()), &PublishParams::default());
+    let mut client = ViewClient::connect(viewer.url(), None, &json!({}));
+    let mut grid = OccupancyGrid {
+        header: header("map_level"),
+        data: vec![0; 16],
+        ..OccupancyGrid::default()
+    };
+    (grid.info.resolution, grid.info.width, grid.info.height) = (0.05, 4, 4);
+    grid.info.origin.position.z = -1.25;
+    let plan = |frame: &str| {
+        let pose = PoseStamped {
+            header: header(frame),
+            pose: Rigid::new(glam::DQuat::IDENTITY, glam::DVec3::new(0.5, 0.25, 0.0)).into(),
+        };
+        let path = standard::Path {
+            header: header(frame),
+            poses: vec![pose.clone(), pose],
+        };
+        payload(&path).unwrap()
+    };
+    // Nobody knows yet how that frame lies.
+    followed.take_plan(&plan("map_level"));
+    followed.take(&dds_type_name::<OccupancyGrid>(), &payload(&grid).unwrap());
+    let turn = glam::DQuat::from_rotation_x(0.5);
+    let transform = TfMessage {
+        transforms: vec![TransformStamped {
+            header: header("map"),
+            child_frame_id: "map_level".to_owned(),
+            transform: Rigid::new(turn, glam::DVec3::ZERO).into(),
+        }],
+    };
+    followed.take(&dds_type_name::<TfMessage>(), &payload(&transform).unwrap());
+    followed.take(&dds_type_name::<OccupancyGrid>(), &payload(&grid).unwrap());
+    followed.take_plan(&plan("elsewhere"));
+    followed.take_plan(&plan("map_level"));
+    while client.events.len() < 2 {
+        client.take();
+    }
+    assert_eq!(
+        (&client.events[0]["type"], &client.events[1]["type"]),
+        (&json!("grid"), &json!("path"))
+    );
+    assert_eq!(client.events[0]["width"], 4);
+    let place = &client.events[1]["points"][0];
+    let found = glam::DVec3::from_array([0, 1, 2].map(|k| place[k].as_f64().unwrap()));
+    // A plan of the plane is drawn just above the ground.
+    let wanted = turn * glam::DVec3::new(0.5, 0.25, -1.2);
+    assert!((found - wanted).length() < 1e-9, "{found}");
+    // An update changes what is drawn.
+    let update = OccupancyGridUpdate {
+        header: header("map_level"),
+        x: 1,
+        y: 1,
+        width: 1,
+        height: 1,
+        data: vec![100],
+    };
+    let before = client.events[0]["png"].clone();
+    client.events.clear();
+    followed.take(
+        &dds_type_name::<OccupancyGridUpdate>(),
+        &payload(&update).unwrap(),
+    );
+    while client.events.is_empty() {
+        client.take();
+    }
+    assert_ne!(client.events[0]["png"], before);
 }
 
 #[test]

@@ -18,7 +18,9 @@ export class Cameras {
   /// Of the scene: a step of the walker, and how far behind the robot the follower stands, metres or units.
   size = 1;
   private readonly keys = new Set<string>();
-  private target: THREE.Matrix4 | null = null;
+  /// Where the robot's camera is among the splats; how those lie may be said later.
+  private target: Pose | null = null;
+  private hasFollowed = false;
   private drag: { x: number; y: number } | null = null;
   private flight: { to: THREE.Matrix4; at: number } | null = null;
 
@@ -57,7 +59,7 @@ export class Cameras {
 
   /// The robot's camera is here now.
   follow(pose: Pose): void {
-    this.target = this.world.cameraMatrix(pose);
+    this.target = pose;
   }
 
   /// Goes to where a camera stood, within a moment.
@@ -82,7 +84,10 @@ export class Cameras {
     }
     if (this.mode === "follow" && this.target) {
       const behind = new THREE.Matrix4().makeTranslation(0, 0.35 * this.size, 1.1 * this.size);
-      this.approach(this.target.clone().multiply(behind), 1 - Math.exp(-FOLLOW_RATE * seconds));
+      // Whoever has just come stands there at once.
+      const share = this.hasFollowed ? 1 - Math.exp(-FOLLOW_RATE * seconds) : 1;
+      this.hasFollowed = true;
+      this.approach(this.world.cameraMatrix(this.target).multiply(behind), share);
       return;
     }
     if (this.mode === "walk") {

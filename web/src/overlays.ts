@@ -34,6 +34,7 @@ export class Overlays {
   private readonly named = new Map<string, THREE.Object3D>();
   /// In the robot's map frame, on the ground.
   private readonly grids = new THREE.Group();
+  private readonly plans = new THREE.Group();
   private hasGrids = true;
   private trailPoints: number[] = [];
   private flashUntil = 0;
@@ -48,7 +49,7 @@ export class Overlays {
       new THREE.SphereGeometry(1, 24, 16),
       new THREE.MeshBasicMaterial({ color: COLOURS.now, transparent: true, opacity: 0.35, depthTest: false }),
     );
-    world.mapFrame.add(this.grids);
+    world.mapFrame.add(this.grids, this.plans);
     const body = new THREE.LineSegments(new THREE.BufferGeometry(), line(COLOURS.now));
     this.now.add(body);
     this.now.visible = false;
@@ -140,8 +141,10 @@ export class Overlays {
 
   setPath(path: PathOverlay): void {
     const line = new THREE.Line(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: COLOURS.plan, depthTest: false, transparent: true }));
+    line.frustumCulled = false;
+    line.renderOrder = 11;
     this.fill(line, path.points.flat());
-    this.replace(path.name, line, this.group);
+    this.replace(path.name, line, this.plans);
   }
 
   async setGrid(grid: GridOverlay): Promise<void> {

@@ -200,6 +200,7 @@ export class World {
 
   /// How the camera of a pose in the splat frame stands in the scene.
   cameraMatrix(pose: Pose): THREE.Matrix4 {
+    this.splatFrame.updateWorldMatrix(true, false);
     const matrix = this.splatFrame.matrixWorld.clone().multiply(matrixOf(pose)).multiply(FLIP);
     const [position, turn, scale] = [new THREE.Vector3(), new THREE.Quaternion(), new THREE.Vector3()];
     matrix.decompose(position, turn, scale);

@@ -88,6 +88,18 @@ async function live(browser) {
   console.log(`     ${found.n} splats at revision ${found.revision}, ${found.keyframes} keyframes`);
   check(found.n > 1000 && found.n === report.splats, "the page holds the splats of the report");
   check(found.errors.length === 0 && page.faults.length === 0, `no error on the page: ${[...found.errors, ...page.faults].join("; ")}`);
+  // Who comes when no frame comes any more stands behind the camera all the same, upright.
+  const late = await opened(browser, await url);
+  await late.waitForFunction(() => window.splatMapper?.nSplats() > 0, { timeout: 60000 });
+  await sleep(3000);
+  const off = await late.evaluate(() => {
+    const { world, cameras } = window.splatMapper.app;
+    const wanted = world.camera.clone();
+    world.cameraMatrix(cameras.target).decompose(wanted.position, wanted.quaternion, wanted.scale);
+    return { turn: world.camera.quaternion.angleTo(wanted.quaternion), up: wanted.up.clone().applyQuaternion(world.camera.quaternion).y };
+  });
+  check(off.turn < 0.05 && off.up > 0.8, `a late page follows the camera: ${off.turn.toFixed(3)} rad off, up ${off.up.toFixed(2)}`);
+  await late.close();
   await page.evaluate(() => window.splatMapper.disconnect());
   await sleep(1000);
   await page.evaluate(() => window.splatMapper.reconnect());

@@ -185,6 +185,7 @@ impl GridStream {
                 grid: &level_grid.grid,
                 map_from_grid: level_grid.level_from_map.inverse(),
                 ground: level_grid.ground,
+                frame: &frame,
             });
             let slice = distances(&level_grid, header());
             publisher.send(&Sample::of(&DISTANCES, level_grid.stamp, &slice)?)?;
@@ -217,7 +218,9 @@ impl GridStream {
 /// As Nav2's static layer takes it: the origin on a multiple of the resolution, without a rotation.
 fn whole(level_grid: &LevelGrid, header: Header) -> OccupancyGrid {
     let grid = &level_grid.grid;
-    let origin = Rigid::new(DQuat::IDENTITY, grid.origin().extend(0.0));
+    // Costmaps do not look at z; RViz draws the grid there.
+    let origin = grid.origin().extend(level_grid.ground);
+    let origin = Rigid::new(DQuat::IDENTITY, origin);
     OccupancyGrid {
         info: MapMetaData {
             map_load_time: header.stamp,

@@ -2,6 +2,8 @@
 
 pub mod error;
 
+pub mod plan;
+
 pub mod transport;
 
 pub mod shared_volume;

@@ -8,10 +8,11 @@ use splat_msgs::ellipsoid_message::EllipsoidArray;
 use splat_msgs::ros::Header;
 use splat_msgs::ros::standard::{PointCloud2, PointField};
 use splat_types::snapshot::Snapshot;
+use splat_volume::blocks::SIDE;
 use splat_volume::ellipsoids::{
     K_SIGMA, MIN_OBSERVATIONS, MIN_OPACITY, Region, ellipsoids, keep_nearest,
 };
-use splat_volume::voxels::{SIDE, State};
+use splat_volume::voxels::State;
 
 pub static ELLIPSOIDS: Topic =
     Topic::of::<EllipsoidArray>("ellipsoids", Delivery::Latched { depth: 1 });
@@ -80,8 +81,11 @@ pub(crate) fn voxel_cloud(volume: &SharedVolume, region: &Region, header: Header
     };
     let mut middles: Vec<DVec3> = Vec::new();
     for block in voxels.indices().into_iter().filter(is_near) {
+        let Some(view) = voxels.block(block) else {
+            continue;
+        };
         for (x, y) in (0..SIDE).flat_map(|x| (0..SIDE).map(move |y| (x, y))) {
-            let states = voxels.states(block, x, y).into_iter().flatten();
+            let states = view.states(x, y).into_iter();
             let surface = states.enumerate().filter(|(_, s)| *s == State::Surface);
             middles.extend(surface.map(|(z, _)| {
                 let at = block * SIDE + IVec3::new(x, y, z as i32);

@@ -137,9 +137,13 @@ impl Output {
             poses: PoseStream::new(mount, params, Arc::clone(&reports), Arc::clone(&cells)),
             status: StatusStream::new(params, Arc::clone(&reports)),
         };
+        let publisher = Arc::new(Publisher::new(transports, latched, service_server));
+        if !params.view.is_empty() && !params.plan_topic.is_empty() {
+            publisher.receive_plans(&params.plan_topic)?;
+        }
         Ok(Self {
             handles: OutputHandles {
-                publisher: Arc::new(Publisher::new(transports, latched, service_server)),
+                publisher,
                 reports,
                 controls,
                 frames: cells,

@@ -39,6 +39,8 @@ pub struct PublishParams {
     /// Highest degree of spherical harmonics that browsers get: 20 bytes a splat at 0, 28 at 1, 44 at 2, 60 at 3.
     #[schemars(range(min = 0, max = 3))]
     pub view_sh_degree: u8,
+    /// Topic of nav_msgs/Path that the viewer draws, over ROS 2 or zenoh: where a planner means to go; empty = none.
+    pub plan_topic: String,
     /// Payload of one chunk of a snapshot.
     #[schemars(range(min = 1024, max = 262144))]
     pub chunk_bytes: usize,
@@ -104,6 +106,7 @@ impl Default for PublishParams {
             view_tls: "off".to_owned(),
             view_clients: 16,
             view_sh_degree: 3,
+            plan_topic: "/plan".to_owned(),
             chunk_bytes: 196608,
             full_map_period: 30.0,
             delta_share: 0.1,

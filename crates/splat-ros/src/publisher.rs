@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use crate::error::PublishError;
 use crate::latched::LatchedStore;
+use crate::plan::PlanSink;
 use crate::service_server::ServiceServer;
 use crate::transport::{Delivery, Event, Sample, Transport};
 
@@ -56,7 +57,9 @@ impl Publisher {
 
     /// Sends to all transports; the first fault is returned once all have had it.
     pub fn send(&self, post: &Sample) -> Result<(), PublishError> {
-        if !matches!(post.topic.delivery, Delivery::Reliable { .. }) {
+        // Transforms are asked for by viewers that come when no frame does.
+        let is_asked_for = post.topic.name == "/tf";
+        if is_asked_for || !matches!(post.topic.delivery, Delivery::Reliable { .. }) {
             self.latched.keep(post);
         }
         let sent = self.transports.iter().map(|transport| transport.send(post));
@@ -68,6 +71,19 @@ impl Publisher {
         self.transports
             .iter()
             .for_each(|transport| transport.observe(event));
+    }
+
+    /// Paths that planners publish on a topic become events, by whatever transport they come.
+    pub fn receive_plans(self: &Arc<Self>, topic: &str) -> Result<(), PublishError> {
+        // Transports belong to the publisher: it must not belong to them.
+        let publisher = Arc::downgrade(self);
+        let sink: PlanSink = Arc::new(move |plan| {
+            if let Some(publisher) = publisher.upgrade() {
+                publisher.observe(&Event::Plan(&plan));
+            }
+        });
+        let mut transports = self.transports.iter();
+        transports.try_for_each(|transport| transport.receive_plans(topic, Arc::clone(&sink)))
     }
 
     /// Ends all transports.

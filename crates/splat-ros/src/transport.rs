@@ -8,6 +8,7 @@ use glam::DQuat;
 use serde::Serialize;
 
 use crate::error::PublishError;
+use crate::plan::{Plan, PlanSink};
 use splat_msgs::map_messages;
 use splat_msgs::ros::Message;
 use splat_types::correction::MapCorrection;
@@ -115,7 +116,11 @@ pub enum Event<'a> {
         map_from_grid: DQuat,
         /// Of the ground in the frame of the grid, metres.
         ground: f64,
+        /// Name of that frame.
+        frame: &'a str,
     },
+    /// A planner somewhere says where it means to go.
+    Plan(&'a Plan),
 }
 
 /// A way out of the node. Called from several threads.
@@ -125,6 +130,11 @@ pub trait Transport: Send + Sync {
 
     /// Most make nothing of events: what they send is made for all of them.
     fn observe(&self, _event: &Event<'_>) {}
+
+    /// Gives paths that planners publish on a topic to `sink`; most receive nothing.
+    fn receive_plans(&self, _topic: &str, _sink: PlanSink) -> Result<(), PublishError> {
+        Ok(())
+    }
 
     /// Where peers may connect; none for most.
     fn endpoints(&self) -> Vec<String> {

@@ -16,6 +16,8 @@ pub mod image;
 
 pub mod transform;
 
+pub mod pages;
+
 pub mod map_frame;
 
 pub mod frame;

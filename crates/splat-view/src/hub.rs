@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{self, FilterType};
 use image::{ExtendedColorType, ImageBuffer, Rgb};
@@ -53,6 +53,7 @@ pub(crate) struct Latest {
     pub(crate) status: Option<Arc<str>>,
     pub(crate) pose: Option<Arc<str>>,
     pub(crate) grid: Option<Arc<str>>,
+    pub(crate) plan: Option<Arc<str>>,
     metres_per_unit: Option<f64>,
 }
 
@@ -109,6 +110,13 @@ impl Hub {
             locked(&self.latest).grid = Some(Arc::clone(&message));
             self.events.send(message).ok();
         }
+    }
+
+    /// Where a planner means to go, in the robot's map frame; metres.
+    pub fn plan(&self, points: &[DVec3]) {
+        let message: Arc<str> = messages::path("plan", points).into();
+        locked(&self.latest).plan = Some(Arc::clone(&message));
+        self.events.send(message).ok();
     }
 
     pub fn correction(&self, correction: &MapCorrection) {

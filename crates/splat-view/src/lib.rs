@@ -18,6 +18,8 @@ mod grid_message;
 
 pub mod hub;
 
+pub mod plan_frames;
+
 pub mod sync;
 
 pub mod embedded;

@@ -141,6 +141,12 @@ pub fn correction(correction: &MapCorrection) -> String {
         .to_string()
 }
 
+/// A line in the robot's map frame, metres.
+pub fn path(name: &str, points: &[DVec3]) -> String {
+    let points: Vec<[f64; 3]> = points.iter().map(DVec3::to_array).collect();
+    json!({"type": "path", "name": name, "points": points}).to_string()
+}
+
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

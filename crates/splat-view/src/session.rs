@@ -117,7 +117,7 @@ impl Session {
         events: &mut broadcast::Receiver<Arc<str>>,
         map: &mut watch::Receiver<Arc<ViewMap>>,
     ) -> Result<(), Ended> {
-        for event in [latest.status, latest.pose, latest.grid]
+        for event in [latest.status, latest.pose, latest.grid, latest.plan]
             .into_iter()
             .flatten()
         {

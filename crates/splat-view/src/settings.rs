@@ -30,4 +30,6 @@ pub struct ViewSettings {
     /// For the page: `live`, `map` or `recording`, and what it shows.
     pub source: &'static str,
     pub title: String,
+    /// Name of the robot's map frame.
+    pub map_frame: String,
 }

@@ -1,9 +1,10 @@
 //! The node's way out to browsers.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::hub::Hub;
+use crate::plan_frames::PlanFrames;
 use crate::server::Server;
 use crate::settings::ViewSettings;
 use crate::view_map::Published;
@@ -18,6 +19,8 @@ pub struct ViewTransport {
     hub: Arc<Hub>,
     server: Server,
     thread: Option<JoinHandle<()>>,
+    /// Frames that plans come in.
+    frames: Mutex<PlanFrames>,
 }
 
 impl ViewTransport {
@@ -32,7 +35,12 @@ impl ViewTransport {
             hub,
             server,
             thread: Some(thread),
+            frames: Mutex::new(PlanFrames::new(&settings.map_frame)),
         })
+    }
+
+    fn frames(&self) -> MutexGuard<'_, PlanFrames> {
+        self.frames.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub fn url(&self) -> &str {
@@ -79,7 +87,15 @@ impl Transport for ViewTransport {
                 grid,
                 map_from_grid,
                 ground,
-            } => self.hub.grid(grid, *map_from_grid, *ground),
+                frame,
+            } => {
+                self.frames().set_grid(frame, *map_from_grid, *ground);
+                self.hub.grid(grid, *map_from_grid, *ground);
+            }
+            Event::Plan(plan) => match self.frames().in_map(plan) {
+                Some(points) => self.hub.plan(&points),
+                None => tracing::debug!("a plan in the frame {:?} is not drawn", plan.frame_id),
+            },
         }
     }
 

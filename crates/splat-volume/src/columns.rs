@@ -4,13 +4,16 @@ use std::collections::HashMap;
 
 use glam::{IVec2, IVec3};
 
-use crate::voxels::{SIDE, State, Voxels};
+use crate::blocks::SIDE;
+use crate::voxels::{State, Voxels};
 
 /// Voxels of a column, from `BELOW` under the level of the ground on.
 pub const HEIGHT: i32 = 128;
 /// Of them below that level.
 pub const BELOW: i32 = 40;
 const N_CELLS: usize = (SIDE * SIDE) as usize;
+/// Of the columns of a tile.
+const TILE_BYTES: usize = N_CELLS * size_of::<Column>() + 24;
 
 /// Bit `k` stands for the voxel `k` above the foot of the columns.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -58,12 +61,12 @@ impl Columns {
         );
         for z in first..=last {
             let block = IVec3::new(tile.x, tile.y, z);
+            let Some(view) = voxels.block(block) else {
+                continue;
+            };
             for (at, column) in columns.iter_mut().enumerate() {
                 let (x, y) = (at as i32 % SIDE, at as i32 / SIDE);
-                let Some(states) = voxels.states(block, x, y) else {
-                    break;
-                };
-                for (k, state) in states.into_iter().enumerate() {
+                for (k, state) in view.states(x, y).into_iter().enumerate() {
                     let bit = z * SIDE + k as i32 - self.foot;
                     if !(0..HEIGHT).contains(&bit) {
                         continue;
@@ -80,6 +83,31 @@ impl Columns {
         columns
     }
 
+    /// Forgets the tiles that are farthest from one of them, until the rest takes no more -> which.
+    pub(crate) fn forget(&mut self, focus: IVec2, max_bytes: usize) -> Vec<IVec2> {
+        let most = max_bytes / TILE_BYTES;
+        if self.tiles.len() <= most {
+            return Vec::new();
+        }
+        let mut all: Vec<(i64, [i32; 2])> = self
+            .tiles
+            .keys()
+            .map(|tile| {
+                let away = (*tile - focus).as_i64vec2().length_squared();
+                (away, tile.to_array())
+            })
+            .collect();
+        // An eighth more than needed: a while passes until the next time.
+        let kept = most - most / 8;
+        all.select_nth_unstable(kept);
+        let gone = all.split_off(kept).into_iter();
+        let gone: Vec<IVec2> = gone.map(|(_, tile)| IVec2::from_array(tile)).collect();
+        for tile in &gone {
+            self.tiles.remove(tile);
+        }
+        gone
+    }
+
     /// Tiles in the order of their indices.
     pub fn tiles(&self) -> Vec<IVec2> {
         let mut all: Vec<IVec2> = self.tiles.keys().copied().collect();
@@ -92,6 +120,6 @@ impl Columns {
     }
 
     pub fn bytes(&self) -> usize {
-        self.tiles.len() * (N_CELLS * size_of::<Column>() + 24)
+        self.tiles.len() * TILE_BYTES
     }
 }

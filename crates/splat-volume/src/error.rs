@@ -1,6 +1,6 @@
 //! What can be wrong with what a volume is given.
 
-/// Nothing was changed where one of these is returned.
+/// Nothing was changed where one of these is returned, but for `Forgotten`.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum VolumeError {
     #[error(
@@ -16,4 +16,8 @@ pub enum VolumeError {
         limit: u64,
         range: f64,
     },
+    #[error(
+        "{n} blocks of 8 x 8 x 8 voxels far from the camera are forgotten, and unknown from now on: grid.max_mib is used up, and {reason}"
+    )]
+    Forgotten { n: usize, reason: String },
 }

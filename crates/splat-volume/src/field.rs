@@ -3,8 +3,9 @@
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
 
+use crate::blocks::SIDE;
 use crate::distance::lower_envelope;
-use crate::voxels::{SIDE, State, Voxels};
+use crate::voxels::{State, Voxels};
 
 /// Voxels around the points of one question: 128 MiB of distances.
 const MAX_VOXELS: i64 = 1 << 25;
@@ -162,12 +163,12 @@ impl Field {
 
 /// Surface voxels of a block, as far as they lie in the box, are sites.
 fn mark(voxels: &Voxels, block: IVec3, (low, size): (IVec3, IVec3), sites: &mut [f32]) {
+    let Some(view) = voxels.block(block) else {
+        return;
+    };
     for y in 0..SIDE {
         for x in 0..SIDE {
-            let Some(column) = voxels.states(block, x, y) else {
-                return;
-            };
-            for (z, state) in column.into_iter().enumerate() {
+            for (z, state) in view.states(x, y).into_iter().enumerate() {
                 let at = block * SIDE + IVec3::new(x, y, z as i32) - low;
                 let is_within = at.min_element() >= 0 && at.cmplt(size).all();
                 if state == State::Surface && is_within {

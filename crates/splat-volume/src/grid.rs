@@ -7,10 +7,10 @@ use std::collections::{HashMap, VecDeque};
 
 use glam::{DVec2, IVec2};
 
+use crate::blocks::SIDE;
 use crate::columns::{Column, Columns, HEIGHT};
 use crate::params::GridParams;
 use crate::volume::Volume;
-use crate::voxels::SIDE;
 
 pub const FREE: i8 = 0;
 pub const OCCUPIED: i8 = 100;

@@ -10,6 +10,8 @@ pub mod params;
 
 pub mod view;
 
+pub mod blocks;
+
 pub mod voxels;
 
 pub mod ground;

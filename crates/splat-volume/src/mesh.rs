@@ -4,11 +4,12 @@
 //! a quadrilateral around each edge that it cuts (Gibson, "Constrained Elastic Surface Nets", 1998). Marching cubes cuts the same edges and needs
 //! about twice the triangles.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use glam::{DVec3, IVec3};
 
-use crate::voxels::{SIDE, Voxels};
+use crate::blocks::SIDE;
+use crate::voxels::Voxels;
 
 /// Level frame, metres.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -61,7 +62,13 @@ pub fn mesh_in(voxels: &Voxels, low: DVec3, high: DVec3) -> Mesh {
     };
     let mut indices = voxels.indices();
     indices.retain(is_touched);
-    mesh_of(voxels, &indices)
+    // Cubes reach into the next blocks. Those that are on disk are read once.
+    let near = |block: &IVec3| {
+        let block = *block;
+        (0..27).map(move |i| block + IVec3::new(i % 3, i / 3 % 3, i / 9) - 1)
+    };
+    let wanted: HashSet<IVec3> = indices.iter().flat_map(near).collect();
+    mesh_of(&voxels.part(wanted.into_iter()), &indices)
 }
 
 fn mesh_of(voxels: &Voxels, indices: &[IVec3]) -> Mesh {

@@ -30,9 +30,13 @@ pub struct GridParams {
     /// Ground that is seen so far below the local ground is an obstacle.
     #[schemars(range(min = 0.02, max = 5.0), extend("unit" = "m"))]
     pub drop_off: f64,
-    /// Memory of voxels and of the depth that they are made of; beyond it the oldest keyframes can no longer move.
+    /// Memory of voxels and of the depth that they are made of; beyond it voxels far from the camera go to disk, and the oldest keyframes can no longer
+    /// move.
     #[schemars(range(min = 16, max = 16384), extend("unit" = "MiB"))]
     pub max_mib: u64,
+    /// Largest file that voxels go to; beyond it, those that are farthest from the camera are forgotten. 0: none.
+    #[schemars(range(min = 0, max = 1048576), extend("unit" = "MiB"))]
+    pub max_page_file_mib: u64,
     /// Least time between two grids.
     #[schemars(range(min = 0.05, max = 60.0), extend("unit" = "s"))]
     pub period: f64,
@@ -55,6 +59,7 @@ impl Default for GridParams {
             max_slope_deg: 15.0,
             drop_off: 0.15,
             max_mib: 256,
+            max_page_file_mib: 1024,
             period: 0.5,
             max_ellipsoids: 10_000,
             allow_unscaled: false,

@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Arc, Weak};
 
-use glam::{DQuat, DVec3, IVec2};
+use glam::{DQuat, DVec3, IVec2, IVec3};
 
+use crate::blocks::{BLOCK_BYTES, SIDE};
 use crate::columns::Columns;
 use crate::ellipsoids::FusedKeyframe;
 use crate::error::VolumeError;
@@ -14,6 +15,7 @@ use crate::view::DepthView;
 use crate::voxels::{Change, MAX_CANDIDATES, Voxels};
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
+use splat_types::pages::PageStore;
 use splat_types::transform::Similarity;
 
 /// A keyframe is fused anew where a point of it has moved by a larger share of a voxel.
@@ -23,6 +25,8 @@ const GROUND_VIEWS: usize = 40;
 const GROUND_POINTS: usize = 400;
 /// Where the ground leans by less in the map frame, degrees, that frame is level enough.
 const MAX_TILT_DEG: f64 = 2.0;
+/// Blocks around the newest keyframe whose columns are read anew.
+const REMEMBERED: i32 = 64;
 /// The level frame is another one where the ground turns out to lean by more, degrees.
 const MAX_LEVEL_ERROR_DEG: f64 = 1.0;
 /// So many more keyframes than at the last look for the ground, and it is looked for again.
@@ -66,6 +70,18 @@ pub struct Volume {
     ground: Option<GroundPlane>,
     n_views_at_level: usize,
     dirty: HashSet<IVec2>,
+    room: Room,
+}
+
+/// What the volume has beside its memory.
+#[derive(Debug, Default)]
+struct Room {
+    /// Of blocks far from the newest keyframe.
+    pages: Option<Box<dyn PageStore>>,
+    /// Tiles whose columns were forgotten; their blocks are still there.
+    tiles: HashSet<IVec2>,
+    /// Where the newest keyframe was when those were looked at last.
+    looked_at: IVec2,
 }
 
 impl Volume {
@@ -81,7 +97,15 @@ impl Volume {
             ground: None,
             n_views_at_level: 0,
             dirty: HashSet::new(),
+            room: Room::default(),
         }
+    }
+
+    /// Blocks far from the newest keyframe go there when memory is short.
+    #[must_use]
+    pub fn paging_to(mut self, pages: Box<dyn PageStore>) -> Self {
+        self.room.pages = Some(pages);
+        self
     }
 
     pub fn voxels(&self) -> &Voxels {
@@ -92,6 +116,11 @@ impl Volume {
     pub fn columns(&mut self) -> &Columns {
         let dirty = std::mem::take(&mut self.dirty);
         self.columns.update(&self.voxels, dirty);
+        let focus = self.focus().truncate();
+        let max_bytes = self.budget() / 2;
+        self.room
+            .tiles
+            .extend(self.columns.forget(focus, max_bytes));
         &self.columns
     }
 
@@ -219,7 +248,8 @@ impl Volume {
                 faults.push(fault);
             }
         }
-        self.make_room();
+        faults.extend(self.make_room());
+        self.remember();
         (n_left, faults)
     }
 
@@ -282,9 +312,37 @@ impl Volume {
             .extend(changed.into_iter().flatten().map(|b| b.truncate()));
     }
 
-    /// Beyond the budget the oldest keyframes lose their depth; what they have seen stays where it is.
-    fn make_room(&mut self) {
-        let budget = usize::try_from(self.params.max_mib << 20).unwrap_or(usize::MAX);
+    fn budget(&self) -> usize {
+        usize::try_from(self.params.max_mib << 20).unwrap_or(usize::MAX)
+    }
+
+    /// The block that the newest keyframe stands in.
+    fn focus(&self) -> IVec3 {
+        let newest = self.keyframes.last_key_value().map(|(_, fused)| fused);
+        let place = newest.map_or(DVec3::ZERO, |fused| {
+            self.in_level(&fused.target).translation
+        });
+        let edge = self.params.resolution * f64::from(SIDE);
+        (place / edge).floor().as_ivec3()
+    }
+
+    /// Beyond the budget blocks far from the newest keyframe go to disk, then the oldest keyframes lose their depth, so that what they have seen
+    /// stays where it is, then far blocks are forgotten, which is returned.
+    fn make_room(&mut self) -> Option<VolumeError> {
+        let budget = self.budget();
+        if self.bytes() <= budget {
+            return None;
+        }
+        let focus = self.focus();
+        let distance = |index: IVec3| (index - focus).as_i64vec3().length_squared();
+        let mut reason = None;
+        if let Some(pages) = &self.room.pages {
+            let n = self.n_too_many();
+            let done = self.voxels.blocks_mut().page_out(n, &**pages, distance);
+            reason = done
+                .reason
+                .map(|reason| format!("{reason}: {}", pages.describe()));
+        }
         let mut bytes = self.bytes();
         while bytes > budget {
             let Some((id, fused)) = self.keyframes.pop_first() else {
@@ -293,6 +351,39 @@ impl Volume {
             bytes -= fused.view.bytes();
             self.settled = Some(id);
         }
+        if bytes <= budget {
+            return None;
+        }
+        let n = self.n_too_many();
+        let gone = self.voxels.blocks_mut().forget(n, distance);
+        self.dirty.extend(gone.iter().map(|b| b.truncate()));
+        let reason = reason.unwrap_or_else(|| "there is no place for it on disk".to_owned());
+        (!gone.is_empty()).then_some(VolumeError::Forgotten {
+            n: gone.len(),
+            reason,
+        })
+    }
+
+    /// Blocks that are to leave memory, so that a while passes until the next ones must; near ones stay.
+    fn n_too_many(&self) -> usize {
+        let budget = self.budget();
+        let over = self.bytes().saturating_sub(budget - budget / 8);
+        let n_in_memory = self.voxels.blocks().n_in_memory();
+        let least = budget / 4 / BLOCK_BYTES;
+        over.div_ceil(BLOCK_BYTES)
+            .min(n_in_memory.saturating_sub(least))
+    }
+
+    /// Columns that were forgotten come back where the camera does.
+    fn remember(&mut self) {
+        let focus = self.focus().truncate();
+        let room = &mut self.room;
+        if room.tiles.is_empty() || (focus - room.looked_at).abs().max_element() < REMEMBERED / 4 {
+            return;
+        }
+        room.looked_at = focus;
+        let near = |tile: &IVec2| (*tile - focus).abs().max_element() <= REMEMBERED;
+        self.dirty.extend(room.tiles.extract_if(near));
     }
 
     /// Looks for the ground while there is none, and again when many more keyframes have come; where it leans against z, the level frame turns

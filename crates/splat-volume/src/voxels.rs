@@ -4,18 +4,15 @@
 //! their index as in Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing", 2013. Sums are whole numbers: what is put in and
 //! taken out again leaves nothing behind, and the order does not matter.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
+use crate::blocks::{Block, Blocks, N_VOXELS, SIDE, Voxel};
 use crate::view::DepthView;
 use splat_types::transform::Similarity;
 
-/// Voxels along an edge of a block.
-pub const SIDE: i32 = 8;
-const N_VOXELS: usize = (SIDE * SIDE * SIDE) as usize;
 /// Steps of a distance within the truncation.
 const STEPS: f32 = 256.0;
 /// Where depth counts in full, metres; it counts less in proportion to its distance beyond.
@@ -31,13 +28,6 @@ const MIN_SURFACE_WEIGHT: u32 = 24;
 const MIN_FREE_WEIGHT: u32 = 8;
 /// Blocks near one keyframe; 32 MiB of indices.
 pub const MAX_CANDIDATES: u64 = 2_000_000;
-
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Voxel {
-    /// Of distances in steps, each times its weight.
-    sum: i32,
-    weight: u32,
-}
 
 /// What is known of a voxel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,8 +51,24 @@ pub struct Voxels {
     pub size: f64,
     /// Metres.
     pub truncation: f64,
-    /// A copy of the whole shares them until they change.
-    blocks: HashMap<IVec3, Arc<[Voxel; N_VOXELS]>>,
+    blocks: Blocks,
+}
+
+/// The voxels of one block.
+#[derive(Debug, Clone)]
+pub struct BlockView<'a> {
+    voxels: &'a Voxels,
+    block: Arc<Block>,
+}
+
+impl BlockView<'_> {
+    /// Eight voxels above each other, from below; `x`, `y` within the block.
+    pub fn states(&self, x: i32, y: i32) -> [State; SIDE as usize] {
+        std::array::from_fn(|z| {
+            let at = offset(IVec3::new(x, y, z as i32));
+            self.voxels.state(self.block[at])
+        })
+    }
 }
 
 /// Whether a keyframe is put in or taken out.
@@ -86,7 +92,7 @@ impl Voxels {
         Self {
             size,
             truncation,
-            blocks: HashMap::new(),
+            blocks: Blocks::default(),
         }
     }
 
@@ -95,28 +101,47 @@ impl Voxels {
     }
 
     pub fn bytes(&self) -> usize {
-        self.blocks.len() * (N_VOXELS * size_of::<Voxel>() + size_of::<IVec3>() + 16)
+        self.blocks.bytes()
     }
 
     /// All blocks, in the order of their indices.
     pub fn indices(&self) -> Vec<IVec3> {
-        let mut all: Vec<IVec3> = self.blocks.keys().copied().collect();
+        let mut all: Vec<IVec3> = self.blocks.indices().collect();
         all.sort_unstable_by_key(|b| [b.x, b.y, b.z]);
         all
     }
 
     pub fn voxel(&self, at: IVec3) -> Voxel {
         let index = at.div_euclid(IVec3::splat(SIDE));
-        let block = self.blocks.get(&index);
+        let block = self.blocks.get(index);
         block.map_or(Voxel::default(), |block| block[offset(at - index * SIDE)])
     }
 
-    /// A column of eight voxels of one block, from below; `x`, `y` within the block.
-    pub fn states(&self, block: IVec3, x: i32, y: i32) -> Option<[State; SIDE as usize]> {
-        let voxels = self.blocks.get(&block)?;
-        Some(std::array::from_fn(|z| {
-            self.state(voxels[offset(IVec3::new(x, y, z as i32))])
-        }))
+    pub fn block(&self, index: IVec3) -> Option<BlockView<'_>> {
+        let block = self.blocks.get(index)?;
+        Some(BlockView {
+            voxels: self,
+            block,
+        })
+    }
+
+    /// Some blocks, all of them in memory.
+    pub(crate) fn part(&self, indices: impl Iterator<Item = IVec3>) -> Self {
+        let mut part = Self::new(self.size, self.truncation);
+        for index in indices {
+            if let Some(block) = self.blocks.get(index) {
+                part.blocks.insert(index, block);
+            }
+        }
+        part
+    }
+
+    pub(crate) fn blocks_mut(&mut self) -> &mut Blocks {
+        &mut self.blocks
+    }
+
+    pub(crate) fn blocks(&self) -> &Blocks {
+        &self.blocks
     }
 
     pub fn state(&self, voxel: Voxel) -> State {
@@ -193,7 +218,7 @@ impl Voxels {
     ) -> Result<Vec<IVec3>, u64> {
         let candidates = self.candidates(view, level_from_cam, range)?;
         let caster = Caster::new(self, view, level_from_cam, range);
-        let found: Vec<(IVec3, Box<[Voxel; N_VOXELS]>)> = candidates
+        let found: Vec<(IVec3, Box<Block>)> = candidates
             .par_iter()
             .with_min_len(64)
             .filter_map(|index| Some((*index, caster.contribution(*index)?)))
@@ -206,12 +231,8 @@ impl Voxels {
         Ok(changed)
     }
 
-    fn merge(&mut self, index: IVec3, own: &[Voxel; N_VOXELS], change: Change) {
-        let block = self
-            .blocks
-            .entry(index)
-            .or_insert_with(|| Arc::new([Voxel::default(); N_VOXELS]));
-        let block = Arc::make_mut(block);
+    fn merge(&mut self, index: IVec3, own: &Block, change: Change) {
+        let block = self.blocks.get_mut(index);
         match change {
             Change::Add => {
                 for (voxel, own) in block.iter_mut().zip(own) {
@@ -223,9 +244,13 @@ impl Voxels {
                 for (voxel, own) in block.iter_mut().zip(own) {
                     voxel.sum = voxel.sum.saturating_sub(own.sum);
                     voxel.weight = voxel.weight.saturating_sub(own.weight);
+                    if voxel.weight == 0 {
+                        // Of a block that was lost, what is left of the sum would say something.
+                        voxel.sum = 0;
+                    }
                 }
                 if block.iter().all(|voxel| voxel.weight == 0) {
-                    self.blocks.remove(&index);
+                    self.blocks.remove(index);
                 }
             }
         }
@@ -301,13 +326,13 @@ impl<'a> Caster<'a> {
     }
 
     /// `None`: nothing of this block was seen.
-    fn contribution(&self, index: IVec3) -> Option<Box<[Voxel; N_VOXELS]>> {
+    fn contribution(&self, index: IVec3) -> Option<Box<Block>> {
         // Relative to the eye, so that single precision is enough a kilometre away.
         let corner = (index * SIDE).as_dvec3() + 0.5;
         let corner = self.cam_from_level * (corner * self.size - self.eye).as_vec3();
         let step = self.size as f32;
         let axes = [0, 1, 2].map(|axis| self.cam_from_level.col(axis) * step);
-        let mut own: Option<Box<[Voxel; N_VOXELS]>> = None;
+        let mut own: Option<Box<Block>> = None;
         for z in 0..SIDE {
             for y in 0..SIDE {
                 let row = corner + axes[1] * y as f32 + axes[2] * z as f32;
@@ -428,7 +453,7 @@ mod tests {
         let before: Vec<_> = voxels
             .indices()
             .into_iter()
-            .map(|i| voxels.blocks[&i].clone())
+            .map(|i| voxels.blocks.get(i))
             .collect();
         let other = at(DVec3::new(-0.3, 0.2, 0.4), -0.4);
         for change in [Change::Add, Change::Remove] {
@@ -437,7 +462,7 @@ mod tests {
         let after: Vec<_> = voxels
             .indices()
             .into_iter()
-            .map(|i| voxels.blocks[&i].clone())
+            .map(|i| voxels.blocks.get(i))
             .collect();
         assert_eq!(before, after);
         voxels

@@ -8,12 +8,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use r2r::{PublisherUntyped, QosProfile};
 
 use crate::error::PublishError;
+use crate::plan::{Plan, PlanSink};
 use crate::ros2::error::LinkError;
 use crate::ros2::lifecycle::Hands;
 use crate::ros2::node::Link;
 use crate::ros2::parameter_store::ParameterStore;
 use crate::ros2::services::{spawn_handler, trigger};
 use crate::transport::{Delivery, Sample, Topic, Transport};
+use splat_msgs::ros::Message;
+use splat_msgs::ros::standard::Path;
 
 /// Not part of every ROS 2: map_msgs comes with Nav2, nvblox_msgs with Isaac ROS.
 const OPTIONAL_PACKAGES: [&str; 2] = ["map_msgs", "nvblox_msgs"];
@@ -101,6 +104,23 @@ impl Transport for Ros2Transport {
                 .map_err(|e| fail(e.to_string())),
             None => Ok(()),
         }
+    }
+
+    fn receive_plans(&self, topic: &str, sink: PlanSink) -> Result<(), PublishError> {
+        let qos = QosProfile::default().keep_last(1);
+        let subscribed =
+            self.link
+                .subscribe(&ros_name(topic), Path::TYPE_NAME, qos, move |payload| {
+                    if let Some(plan) = Plan::read(&payload) {
+                        sink(plan);
+                    }
+                    true
+                });
+        subscribed.map_err(|e| PublishError::Param {
+            name: "plan_topic",
+            found: topic.to_owned(),
+            expected: format!("a topic that can be subscribed ({e})"),
+        })
     }
 
     fn close(&self) -> Result<(), PublishError> {

@@ -5,6 +5,7 @@ use zenoh::Session;
 use crate::error::PublishError;
 use crate::params::PublishParams;
 use crate::transport::{Delivery, Topic};
+use splat_msgs::ros::Message;
 use splat_msgs::services::Service;
 use splat_msgs::type_hash::{dds_name, hash_of, service_hash};
 
@@ -49,6 +50,16 @@ impl Names {
             self.full(topic.name),
             dds_name(topic.type_name),
             hash_of(topic.type_name, topic.definition)
+        )
+    }
+
+    /// Of a topic that others publish, below our namespace unless it begins with `/`; whatever hash they have for the type.
+    pub(crate) fn incoming_key<T: Message>(&self, topic: &str) -> String {
+        format!(
+            "{}/{}/{}/*",
+            self.domain_id,
+            self.full(topic),
+            dds_name(T::TYPE_NAME)
         )
     }
 

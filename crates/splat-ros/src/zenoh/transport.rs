@@ -19,10 +19,12 @@ use zenoh::{Session, Wait};
 use crate::error::PublishError;
 use crate::latched::LatchedStore;
 use crate::params::PublishParams;
+use crate::plan::{Plan, PlanSink};
 use crate::service_server::ServiceServer;
 use crate::transport::{Delivery, Sample, Topic, Transport};
 use crate::zenoh::names::Names;
 use crate::zenoh::session::open_session;
+use splat_msgs::ros::standard::Path;
 use splat_msgs::services::{SERVICES, Service};
 
 /// `close` waits no longer. zenoh itself lingers ten seconds over bytes that a stalled peer never takes.
@@ -64,6 +66,7 @@ pub struct ZenohTransport {
     ways: Ways,
     declared: Mutex<Option<Declared>>,
     endpoints: Vec<String>,
+    names: Names,
 }
 
 impl std::fmt::Debug for ZenohTransport {
@@ -143,6 +146,7 @@ impl ZenohTransport {
             ways,
             declared: Mutex::new(Some(declared)),
             endpoints,
+            names,
         })
     }
 }
@@ -159,6 +163,32 @@ impl Transport for ZenohTransport {
             .wait()
             .map_err(|e| PublishError::Send {
                 key: way.key.clone(),
+                reason: e.to_string(),
+            })
+    }
+
+    fn receive_plans(&self, topic: &str, sink: PlanSink) -> Result<(), PublishError> {
+        let key = self.names.incoming_key::<Path>(topic);
+        let subscriber = self
+            .session
+            .declare_subscriber(&key)
+            .callback(move |sample| {
+                let payload = sample.payload().to_bytes();
+                match Plan::read(&payload) {
+                    Some(plan) => sink(plan),
+                    None => tracing::debug!(
+                        "{} bytes on {} are no path",
+                        payload.len(),
+                        sample.key_expr()
+                    ),
+                }
+            });
+        // It ends with the session.
+        subscriber
+            .background()
+            .wait()
+            .map_err(|e| PublishError::Open {
+                endpoints: key.clone(),
                 reason: e.to_string(),
             })
     }

@@ -26,7 +26,7 @@ use crate::mapper::keyframes::tracker_views::views_of;
 use crate::mapper::last_good::LastGood;
 use crate::mapper::metric_scale::MetricScale;
 use crate::mapper::metric_scale_params::ScaleParams;
-use crate::mapper::pages::{PageStore, Paging};
+use crate::mapper::pages::Paging;
 use crate::mapper::params::{MapperParams, PoseEmbedding, PoseOptimization};
 use crate::mapper::parts::Parts;
 use crate::mapper::splats::store::SplatSet;
@@ -43,6 +43,7 @@ use splat_geometry::answer::{GeometryBatch, PoseStd, View};
 use splat_types::correction::{MapCorrection, Reason};
 use splat_types::frame::Batch;
 use splat_types::map_frame::MapFrame;
+use splat_types::pages::PageStore;
 use splat_types::snapshot::Scale;
 use splat_types::sparse_point::SparsePoint;
 

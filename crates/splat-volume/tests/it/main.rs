@@ -1,5 +1,6 @@
 //! The volume and its grid in a world of boxes whose geometry is exact.
 
+mod memory;
 mod splats;
 mod world;
 

@@ -11,10 +11,10 @@ use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 
-use crate::mapper::pages::Page;
 use splat_image::codec;
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
+use splat_types::pages::Page;
 
 /// Errors of a JPEG at this quality are below 40 dB, those of a map at 25 to 30 dB.
 const JPEG_QUALITY: u8 = 92;

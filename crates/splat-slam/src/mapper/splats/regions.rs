@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::mapper::pages::Page;
 use crate::mapper::splats::region_codec::take_region;
 use crate::mapper::splats::transform::Carry;
+use splat_types::pages::Page;
 use splat_types::splats::splats::Splats;
 use splat_types::transform::{Rigid, Similarity};
 
