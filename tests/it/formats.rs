@@ -97,7 +97,7 @@ fn checkpoint(n_splats: usize, sh_degree: u8) -> Checkpoint {
         update_counts: (0..n_splats as u16).collect(),
         map_frame: Some(MapFrame {
             world_from_cam: Rigid::new(DQuat::from_rotation_x(0.3), DVec3::new(1.0, -2.0, 0.5)),
-            map_from_cam: Rigid::new(DQuat::from_rotation_z(-0.7), DVec3::new(0.0, 3.0, 1.2)),
+            map_from_camera: Rigid::new(DQuat::from_rotation_z(-0.7), DVec3::new(0.0, 3.0, 1.2)),
         }),
         ..Checkpoint::of(random_snapshot(n_splats, 5, sh_degree, 9), 11, 3000)
     }
@@ -126,7 +126,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
         assert_eq!(back.update_counts, written.update_counts);
         assert_eq!(back.map_frame, written.map_frame);
     }
-    // Older files have no such section, and a map that no robot was told of an empty one.
+    // Older files have no such section, and a map of a run that published nothing an empty one.
     let written = Checkpoint {
         map_frame: None,
         ..checkpoint(10, 0)
@@ -136,7 +136,7 @@ fn a_checkpoint_reads_back_equal_for_every_sh_degree() {
     let broken = Checkpoint {
         map_frame: Some(MapFrame {
             world_from_cam: Rigid::IDENTITY,
-            map_from_cam: Rigid::new(DQuat::IDENTITY, DVec3::NAN),
+            map_from_camera: Rigid::new(DQuat::IDENTITY, DVec3::NAN),
         }),
         ..checkpoint(10, 0)
     };

@@ -221,7 +221,7 @@ fn compared(published: &OccupancyGrid, grid: &Grid) -> (usize, usize) {
 }
 
 #[test]
-fn a_saved_map_keeps_the_frame_that_the_robot_was_told() {
+fn a_saved_map_keeps_the_frame_that_was_published() {
     let folder = tempfile::tempdir().unwrap();
     let (out, sent) = (folder.path().join("out"), folder.path().join("sent.mcap"));
     // By structure from motion, whose first frame with a pose is not its first keyframe.
@@ -231,7 +231,7 @@ fn a_saved_map_keeps_the_frame_that_the_robot_was_told() {
         ros::decode::<OccupancyGrid>(&grid).unwrap()
     };
     let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
-    let frame = map.map_frame.expect("a robot was told");
+    let frame = map.map_frame.expect("it was published");
     assert!(frame.world_from_cam.translation.length() > 0.01);
     let mut volume = planner_map::volume(&map, &GridParams::default()).unwrap();
     let exported = planner_map::grid_of(&mut volume).unwrap();

@@ -34,7 +34,7 @@ pub fn forward_camera() -> Rigid {
 pub fn beginning_at(world_from_cam: Rigid) -> MapFrame {
     MapFrame {
         world_from_cam,
-        map_from_cam: forward_camera(),
+        map_from_camera: forward_camera(),
     }
 }
 
@@ -77,7 +77,7 @@ impl FrameTree {
     pub fn anchor(&mut self, world_from_cam: Rigid, map_from_cam: Rigid) {
         self.anchor = Some(MapFrame {
             world_from_cam,
-            map_from_cam,
+            map_from_camera: map_from_cam,
         });
     }
 

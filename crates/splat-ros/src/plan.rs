@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_is_read_and_a_long_one_thinned_to_its_end() {
+    fn a_path_is_read_and_a_long_one_reduced_to_its_end() {
         let plan = Plan::read(&path([[1.0, 2.0, 0.0], [1.5, 2.0, 0.0]].into_iter())).unwrap();
         assert_eq!(plan.frame_id, "map");
         assert_eq!(plan.points[1], DVec3::new(1.5, 2.0, 0.0));

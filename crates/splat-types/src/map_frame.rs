@@ -9,17 +9,17 @@ pub struct MapFrame {
     /// Units of the splats; optical axes.
     pub world_from_cam: Rigid,
     /// Metres, z up.
-    pub map_from_cam: Rigid,
+    pub map_from_camera: Rigid,
 }
 
 impl MapFrame {
     /// Takes splats to the map frame, `metres` a unit.
     pub fn map_from_world(&self, metres: f64) -> Similarity {
-        let rotation = self.map_from_cam.rotation * self.world_from_cam.rotation.inverse();
+        let rotation = self.map_from_camera.rotation * self.world_from_cam.rotation.inverse();
         Similarity {
             scale: metres,
             rotation,
-            translation: self.map_from_cam.translation
+            translation: self.map_from_camera.translation
                 - rotation * self.world_from_cam.translation * metres,
         }
     }

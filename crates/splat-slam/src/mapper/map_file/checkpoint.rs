@@ -46,7 +46,7 @@ pub struct Checkpoint {
     pub seed: u64,
     /// Optimiser updates made so far.
     pub steps: u64,
-    /// Where the robot's map frame lies; `None` where no robot was told.
+    /// Where the robot's map frame lies; `None` where nothing was published.
     pub map_frame: Option<MapFrame>,
     /// Landmarks by which a later run finds its place, as `track::Tracker` saves them; empty where there are none.
     pub landmarks: Vec<u8>,

@@ -26,7 +26,7 @@ const IS_HELD_OUT: u32 = 1;
 
 /// Empty where there is none.
 pub(crate) fn map_frame_bytes(frame: Option<MapFrame>) -> Vec<u8> {
-    let poses = frame.map(|frame| [frame.world_from_cam, frame.map_from_cam]);
+    let poses = frame.map(|frame| [frame.world_from_cam, frame.map_from_camera]);
     let numbers = poses.into_iter().flatten().flat_map(|pose| {
         let (q, t) = (pose.rotation, pose.translation);
         [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
@@ -50,10 +50,10 @@ pub(crate) fn parse_map_frame(mut content: &[u8]) -> Result<Option<MapFrame>, St
     };
     let frame = MapFrame {
         world_from_cam: pose(&numbers[..7]),
-        map_from_cam: pose(&numbers[7..]),
+        map_from_camera: pose(&numbers[7..]),
     };
     let is_sound = |pose: &Rigid| pose.is_finite() && (pose.rotation.length() - 1.0).abs() < 1e-6;
-    if is_sound(&frame.world_from_cam) && is_sound(&frame.map_from_cam) {
+    if is_sound(&frame.world_from_cam) && is_sound(&frame.map_from_camera) {
         Ok(Some(frame))
     } else {
         Err("its poses are none".to_owned())
