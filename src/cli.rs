@@ -184,7 +184,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 #[derive(Debug, Args)]
 struct SynthArgs {
-    /// room, facade, corridor or hallway
+    /// room, facade, corridor, hallway or house
     scene: String,
     /// Recording to write, FILE.mcap; its poses go beside it as .tum. With --layout a new folder
     #[arg(long, value_name = "PATH")]

@@ -33,7 +33,7 @@ pub(crate) fn take() -> Take {
     Take::new(settings).unwrap()
 }
 
-fn replayed(input: &str, geometry: &str, out: &Path, more: &[&str]) {
+pub(crate) fn replayed(input: &str, geometry: &str, out: &Path, more: &[&str]) {
     let mut args = vec!["replay", input, "--geometry", geometry, "--backend", "cpu"];
     args.extend(["--out", out.to_str().unwrap()]);
     args.extend(more);
@@ -154,7 +154,7 @@ fn with_depth(map: &Checkpoint, depth_of: impl Fn(&KeyframePose) -> DepthMap) ->
     map
 }
 
-fn frame_of(take: &Take, pose: &KeyframePose) -> u32 {
+pub(crate) fn frame_of(take: &Take, pose: &KeyframePose) -> u32 {
     let mut frames = 0..take.settings().n_frames;
     frames.find(|ix| take.stamp(*ix) == pose.stamp).unwrap()
 }
@@ -184,7 +184,7 @@ fn grid_of(map: &Checkpoint) -> Grid {
 }
 
 /// Of both grids where both decide.
-fn decided<'a>(a: &'a Grid, b: &'a Grid) -> impl Iterator<Item = (IVec2, i8, i8)> + 'a {
+pub(crate) fn decided<'a>(a: &'a Grid, b: &'a Grid) -> impl Iterator<Item = (IVec2, i8, i8)> + 'a {
     let (first, width) = (a.extent.first, a.extent.width);
     let cells = (0..a.cells.len() as i32).map(move |at| first + IVec2::new(at % width, at / width));
     let both = cells.map(|cell| (cell, a.cell(cell), b.cell(cell)));
@@ -215,7 +215,7 @@ fn a_kitchen_from_stereo_is_that_of_a_depth_camera() {
 }
 
 /// Whether a cell near this one, or itself, has the value.
-fn is_near(grid: &Grid, cell: IVec2, value: i8) -> bool {
+pub(crate) fn is_near(grid: &Grid, cell: IVec2, value: i8) -> bool {
     (-1..=1).any(|x| (-1..=1).any(|y| grid.cell(cell + IVec2::new(x, y)) == value))
 }
 

@@ -32,6 +32,7 @@ mod hard_world;
 mod hooked;
 mod hostile_bags;
 mod hostile_scenes;
+mod house;
 mod html;
 mod images;
 mod joint;

@@ -182,7 +182,7 @@ fn the_source_straightens_lenses_when_asked() {
 #[test]
 fn a_wrong_scene_or_option_is_refused_with_what_would_be_right() {
     for (text, hint) in [
-        ("rooom", "room, facade, corridor or hallway"),
+        ("rooom", "room, facade, corridor, hallway or house"),
         ("room?frame=3", "frames, width"),
         ("room?frames=0", "[1, 100000]"),
         ("room?frames=1e99", "[1, 100000]"),

@@ -46,6 +46,8 @@ mod corridor;
 
 mod hallway;
 
+mod house;
+
 mod room;
 
 mod street;

@@ -186,6 +186,7 @@ impl FromStr for SceneKind {
             "facade" => Ok(Self::Facade),
             "corridor" => Ok(Self::Corridor),
             "hallway" => Ok(Self::Hallway),
+            "house" => Ok(Self::House),
             _ => Err(SynthError::Scene {
                 found: text.to_owned(),
             }),

@@ -11,7 +11,7 @@ pub(crate) const RATES: [f64; 2] = [1.0, 1000.0];
 
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
-    #[error("{found:?} is no synthetic scene, expected room, facade, corridor or hallway")]
+    #[error("{found:?} is no synthetic scene, expected room, facade, corridor, hallway or house")]
     Scene { found: String },
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
@@ -43,6 +43,8 @@ pub enum SceneKind {
     Corridor,
     /// A straight hallway of bays that are all alike; no place is seen twice.
     Hallway,
+    /// Two rooms and the door between them, walked in a figure of eight.
+    House,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

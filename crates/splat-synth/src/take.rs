@@ -14,7 +14,7 @@ use crate::geometry::Ray;
 use crate::movers::{self, Mover};
 use crate::scene::Scene;
 use crate::settings::{RATE, SceneKind, SynthError, SynthSettings};
-use crate::{corridor, facade, hallway, noise, room, trajectory};
+use crate::{corridor, facade, hallway, house, noise, room, trajectory};
 use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
@@ -48,13 +48,14 @@ pub struct Take {
 impl Take {
     /// Builds the scene and its light on first use (about a second); later takes share it.
     pub fn new(settings: SynthSettings) -> Result<Self, SynthError> {
-        static SCENES: [OnceLock<Arc<Scene>>; 4] = [const { OnceLock::new() }; 4];
+        static SCENES: [OnceLock<Arc<Scene>>; 5] = [const { OnceLock::new() }; 5];
         settings.check()?;
         let (slot, build): (usize, fn() -> Scene) = match settings.scene {
             SceneKind::Room => (0, room::scene),
             SceneKind::Facade => (1, facade::scene),
             SceneKind::Corridor => (2, corridor::scene),
             SceneKind::Hallway => (3, hallway::scene),
+            SceneKind::House => (4, house::scene),
         };
         let scene = SCENES[slot].get_or_init(|| Arc::new(build())).clone();
         Ok(Self { settings, scene })

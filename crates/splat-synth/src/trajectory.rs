@@ -19,6 +19,7 @@ pub(crate) fn gt_from_cam(scene: SceneKind, secs: f64, seed: u32) -> Rigid {
         SceneKind::Facade => along_the_street(turn),
         SceneKind::Corridor => through_the_corridor(turn),
         SceneKind::Hallway => along_the_hallway(secs),
+        SceneKind::House => through_both_rooms(turn),
     };
     let rotation = looking(target - position) * DQuat::from_scaled_axis(shake(secs, seed, 0.008));
     Rigid::new(
@@ -76,6 +77,16 @@ fn through_the_corridor(turn: f64) -> (DVec3, DVec3) {
     let ahead = place(turn + 0.45) - position;
     let across = DVec3::new(-ahead.y, ahead.x, 0.0);
     (position, position + ahead + across * side - DVec3::Z * 0.1)
+}
+
+/// A figure of eight (the lemniscate of Gerono) whose crossing lies in the door, looking ahead and now and then to a side.
+fn through_both_rooms(turn: f64) -> (DVec3, DVec3) {
+    let place = |turn: f64| DVec3::new(2.5 * turn.sin(), 0.85 * (2.0 * turn).sin(), 1.45);
+    let side = 0.8 * (3.0 * turn).sin();
+    let position = place(turn);
+    let ahead = place(turn + 0.3) - position;
+    let across = DVec3::new(-ahead.y, ahead.x, 0.0);
+    (position, position + ahead + across * side - DVec3::Z * 0.2)
 }
 
 /// Straight on, and at rest at the end; the camera looks about as often as bays go by, so that bays look alike, too.
