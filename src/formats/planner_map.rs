@@ -53,7 +53,7 @@ pub enum PlannerError {
     )]
     Unscaled,
     #[error(
-        "no ground was seen: a plane of 3 % of all points that leans by less than 25 degrees from level, with nothing below it"
+        "no ground was seen: a plane with 3 % of all places seen that leans by less than 25 degrees from level, with nothing below it"
     )]
     NoGround,
     #[error("the depth of keyframe {keyframe_id} cannot be read: {reason}")]

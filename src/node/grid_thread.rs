@@ -132,6 +132,9 @@ impl GridStage {
             };
             self.warn_of(&faults);
             if n_left == 0 || (has_newer() && !input.is_last) {
+                tracing::debug!(
+                    "grid: {n_left} keyframes are still to be fused where they are now"
+                );
                 break;
             }
         }

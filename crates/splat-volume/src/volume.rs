@@ -22,7 +22,11 @@ use splat_types::transform::Similarity;
 const MAX_MOVE: f64 = 0.5;
 /// Keyframes that the ground is looked for in, and points of each.
 const GROUND_VIEWS: usize = 40;
-const GROUND_POINTS: usize = 400;
+const GROUND_POINTS: usize = 1500;
+/// Of points so near each other, metres, one counts: a wall beside the camera fills images, and the floor is seen at a flat angle.
+const GROUND_CELL: f64 = 0.1;
+/// Of more points every n-th.
+const MAX_GROUND_POINTS: usize = 15_000;
 /// Where the ground leans by less in the map frame, degrees, that frame is level enough.
 const MAX_TILT_DEG: f64 = 2.0;
 /// Blocks around the newest keyframe whose columns are read anew.
@@ -404,6 +408,7 @@ impl Volume {
             let near = fused.view.points(stride).filter(|p| p.z <= far);
             points.extend(near.map(|p| fused.target.transform_point(p)));
         }
+        let points = spread_out(&points);
         // Where the map frame is not level, cameras that are held upright say more.
         let cameras = self.keyframes.values();
         let up: DVec3 = cameras.map(|k| k.target.rotation * DVec3::NEG_Y).sum();
@@ -434,4 +439,20 @@ impl Volume {
         }
         self.ground = Some(ground);
     }
+}
+
+/// One point of each cell, in their order, and not too many.
+fn spread_out(points: &[DVec3]) -> Vec<DVec3> {
+    let mut taken = HashSet::new();
+    let cell = |p: &DVec3| (*p / GROUND_CELL).floor().as_ivec3();
+    let mut kept: Vec<DVec3> = points
+        .iter()
+        .copied()
+        .filter(|p| taken.insert(cell(p)))
+        .collect();
+    let every = kept.len().div_ceil(MAX_GROUND_POINTS).max(1);
+    if every > 1 {
+        kept = kept.into_iter().step_by(every).collect();
+    }
+    kept
 }

@@ -396,3 +396,35 @@ fn states_say_what_a_voxel_is() {
     assert_eq!(state(DVec3::new(5.0, 2.5, 90.0)), State::Unknown);
     let _: DVec2 = world.size();
 }
+
+#[test]
+fn a_floor_that_few_pixels_show_is_found() {
+    // A camera held at eye level in a corridor: walls fill its images, and stereo has measured one pixel of seven of a plain floor.
+    let world = World::corridor();
+    let poses: Vec<Similarity> = (0..24)
+        .map(|i| {
+            forward(
+                DVec3::new(0.5 + 0.35 * f64::from(i), 0.9, 1.55),
+                0.0,
+                -0.03,
+                METRES,
+            )
+        })
+        .collect();
+    let mut keyframes = keyframes(&world, &poses);
+    for (keyframe, pose) in keyframes.iter_mut().zip(&poses) {
+        let mut depth = world.depth(pose);
+        for at in 0..depth.depth.len() {
+            let (x, y) = (at as u32 % CAMERA.width_px, at as u32 / CAMERA.width_px);
+            let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let place = CAMERA.ray_in_cam(pixel) * f64::from(depth.depth[at]);
+            let is_floor = pose.transform_point(place).z < 0.01;
+            if is_floor && at % 7 != 0 {
+                depth.confidence[at] = 0.0;
+            }
+        }
+        keyframe.depth = Arc::new(depth);
+    }
+    let ground = fused(&keyframes).ground().expect("a ground");
+    assert!(ground.height.abs() < 0.01, "{ground:?}");
+}

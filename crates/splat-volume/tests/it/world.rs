@@ -51,6 +51,14 @@ impl World {
         world
     }
 
+    /// 14 m long and 1.8 m wide, empty.
+    pub(crate) fn corridor() -> Self {
+        Self {
+            size: DVec3::new(14.0, 1.8, 2.5),
+            boxes: Vec::new(),
+        }
+    }
+
     pub(crate) fn size(&self) -> DVec2 {
         self.size.truncate()
     }
