@@ -193,3 +193,39 @@ fn surfaces_and_distances(volume: &Volume, truth: &Volume) {
     );
     assert!(errors.len() > 300 && p95 <= 1.2 * VOXEL, "{p95} m");
 }
+
+#[test]
+fn a_start_at_the_door_waits_for_the_keyframe_that_decides() {
+    // As live: three keyframes at once. Most of what they show is one wall, which two motions explain about equally well; the wrong one put the first
+    // keyframes off by half of the path.
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let scene = "synthetic:house?frames=40&width=320&height=240";
+    let small = ["select.batch_size=3", "select.batch_overlap=1"];
+    let mut more = vec!["--steps", "1"];
+    more.extend(small.iter().flat_map(|set| ["--set", set]));
+    replayed(scene, "sfm", &out, &more);
+    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+    let settings = SynthSettings {
+        n_frames: 40,
+        width_px: 320,
+        height_px: 240,
+        ..SynthSettings::of(SceneKind::House)
+    };
+    let take = Take::new(settings).unwrap();
+    let poses = &map.snapshot.poses;
+    let own: Vec<Rigid> = poses.iter().map(|pose| pose.world_from_cam).collect();
+    let wanted: Vec<Rigid> = poses
+        .iter()
+        .map(|pose| take.pose(frame_of(&take, pose)))
+        .collect();
+    assert!(own.len() > 20, "{} keyframes", own.len());
+    let aligned = align(&own, &wanted).unwrap().reference_from_estimate;
+    let off = own.iter().zip(&wanted).map(|(own, wanted)| {
+        aligned
+            .transform_point(own.translation)
+            .distance(wanted.translation)
+    });
+    let worst = off.fold(0.0, f64::max);
+    assert!(worst < 0.03, "{worst} m");
+}
