@@ -28,12 +28,18 @@ pub(crate) struct Opened {
 }
 
 /// Takes over the calls of services.
-pub(crate) fn open(job: &mut Job, scale: Scale) -> anyhow::Result<Opened> {
+/// `has_depth_of_poses`: as the geometry model says.
+pub(crate) fn open(
+    job: &mut Job,
+    scale: Scale,
+    has_depth_of_poses: bool,
+) -> anyhow::Result<Opened> {
     let params = &job.params;
     let engine = job.engines.best(params.backend, params.deterministic)?;
     let pages = PageFile::new(job.out.as_deref(), params.map.max_page_file_mib << 20);
     let mut map = Mapper::new(params.mapper(), params.seed, scale, engine)
         .measuring_scale(&params.scale)
+        .with_depth_of_poses(has_depth_of_poses)
         .paging_to(Box::new(pages));
     if params.train.start == Start::Points {
         map = map.starting_from(start_points(job)?);

@@ -97,7 +97,7 @@ fn run_with(
         mut map,
         mut track,
         first_id,
-    } = open::open(&mut job, scale)?;
+    } = open::open(&mut job, scale, model.has_depth_of_poses())?;
     let fits = job.params.track.photometric != Photometric::Off;
     if job.is_live && fits && track.is_on() {
         let (client, fitter) = refinement::pair();

@@ -54,6 +54,11 @@ pub trait GeometryModel: Send {
         None
     }
 
+    /// Whether depth and poses have one scale, view by view: depth that comes of matching the views by their poses.
+    fn has_depth_of_poses(&self) -> bool {
+        false
+    }
+
     /// Whether it answers a batch of one new keyframe as well as a full one, once it has registered some.
     fn accepts_small_batches(&self) -> bool {
         false

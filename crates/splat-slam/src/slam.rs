@@ -106,11 +106,13 @@ impl Slam {
         engine: Box<dyn Engine>,
         scale: Scale,
     ) -> Self {
+        let has_depth_of_poses = model.has_depth_of_poses();
         Self {
             selector: Selector::new(params.select.clone()),
             batcher: Batcher::new(&params.select),
             model,
-            mapper: Mapper::new(params.mapper.clone(), params.seed, scale, engine),
+            mapper: Mapper::new(params.mapper.clone(), params.seed, scale, engine)
+                .with_depth_of_poses(has_depth_of_poses),
             tracker: params.track.enabled.then(|| Tracker::new(&params.track)),
             params,
         }

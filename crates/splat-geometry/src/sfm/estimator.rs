@@ -475,6 +475,10 @@ impl Sfm {
 }
 
 impl GeometryModel for Sfm {
+    fn has_depth_of_poses(&self) -> bool {
+        true
+    }
+
     fn accepts_small_batches(&self) -> bool {
         true
     }

@@ -1,6 +1,6 @@
 //! Depth that a model gave for one view, beside what the map shows there -> the factor between them.
 //!
-//! Models that know no metres err in the scale of single views. The map, learnt from many views, is the better rule;
+//! Networks that know no metres err in the scale of single views. The map, learnt from many views, is the better rule;
 //! once it has been laid beside a new view's depth a few times, that depth stays.
 
 use std::sync::Arc;
@@ -12,7 +12,6 @@ use splat_engine::error::EngineError;
 use splat_engine::traits::Engine;
 use splat_types::depth::DepthMap;
 use splat_types::rendering::Rendering;
-use splat_types::snapshot::ScaleSource;
 
 /// Looks at a new view before its depth is left alone.
 const N_LOOKS: u8 = 2;
@@ -23,15 +22,14 @@ const MIN_CHANGE: f32 = 0.002;
 /// Where the map shows less, it has no surface yet.
 const MIN_ALPHA: f32 = 0.8;
 
-/// Fits the depth of views to the map, where the model's lengths are relative: of `max_views` that were looked at too
+/// Fits the depth of views to the map, where each may have a scale of its own: of `max_views` that were looked at too
 /// seldom so far, the oldest first, as each look takes a rendering.
 pub(crate) fn scale_depths(
-    source: ScaleSource,
     max_views: usize,
     keyframes: &mut KeyframeStore,
     engine: &mut dyn Engine,
 ) -> Result<(), EngineError> {
-    if source == ScaleSource::Given || engine.len() == 0 {
+    if engine.len() == 0 {
         return Ok(());
     }
     let is_due =

@@ -101,6 +101,7 @@ pub(crate) struct MetricScale {
     params: Option<ScaleParams>,
     /// The model's lengths are metres.
     is_given: bool,
+    has_depth_of_poses: bool,
 }
 
 impl MetricScale {
@@ -109,7 +110,17 @@ impl MetricScale {
             scale,
             params: None,
             is_given: scale == Scale::GIVEN,
+            has_depth_of_poses: false,
         }
+    }
+
+    pub(crate) fn set_one_for_all_views(&mut self, has: bool) {
+        self.has_depth_of_poses = has;
+    }
+
+    /// Depth of single views needs no factor.
+    pub(crate) fn is_one_for_all_views(&self) -> bool {
+        self.has_depth_of_poses || self.scale.source == ScaleSource::Given
     }
 
     /// From now on looks for metres by these parameters, unless the geometry has them.
