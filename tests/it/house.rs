@@ -186,11 +186,6 @@ fn surfaces_and_distances(volume: &Volume, truth: &Volume) {
         .collect();
     errors.sort_by(f64::total_cmp);
     let p95 = errors[errors.len() * 95 / 100];
-    println!(
-        "surface {median:.4} m, distances p95 {p95:.4} m of {}, scale {:.4}",
-        errors.len(),
-        own_from_truth.scale
-    );
     assert!(errors.len() > 300 && p95 <= 1.2 * VOXEL, "{p95} m");
 }
 

@@ -167,7 +167,7 @@ fn partition(props: &mut Props) {
     );
 }
 
-/// Pictures along a wall, no two alike.
+/// Paintings along a wall, no two alike.
 fn hangings(props: &mut Props, [x, y]: [f64; 2], facing: f64, wall: u32) {
     const MOTIFS: [Painting; 9] = [
         Painting::Page,

@@ -95,7 +95,7 @@ pub(crate) fn start(
             && one.min(another) > ALIKE * one.max(another)
             && waiting.len() < DECISIVE
         {
-            // The next keyframes tell them apart.
+            // The next keyframes decide.
             (best, is_enough) = (before, false);
         }
         if is_enough {
