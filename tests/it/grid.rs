@@ -24,13 +24,7 @@ use splat_volume::params::GridParams;
 const SCENE: &str = "synthetic:room?frames=48&width=320&height=240";
 
 pub(crate) fn take() -> Take {
-    let settings = SynthSettings {
-        n_frames: 48,
-        width_px: 320,
-        height_px: 240,
-        ..SynthSettings::of(SceneKind::Room)
-    };
-    Take::new(settings).unwrap()
+    filmed(SceneKind::Room, 48)
 }
 
 pub(crate) fn replayed(input: &str, geometry: &str, out: &Path, more: &[&str]) {
@@ -258,26 +252,44 @@ fn a_grid_from_stereo_is_the_grid_from_exact_depth() {
     );
 }
 
-/// Walls of four corridors, mapped by the map's own poses and depth, beside those of the true poses and exact depth.
-#[test]
-fn after_a_loop_there_is_one_wall_and_it_is_where_it_was() {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("out");
-    let scene = "synthetic:corridor?frames=220&width=320&height=240";
-    replayed(scene, "sfm", &out, &["--steps", "1"]);
-    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+/// What a camera films that walks through a scene.
+pub(crate) fn filmed(scene: SceneKind, n_frames: u32) -> Take {
     let settings = SynthSettings {
-        n_frames: 220,
+        n_frames,
         width_px: 320,
         height_px: 240,
-        ..SynthSettings::of(SceneKind::Corridor)
+        ..SynthSettings::of(scene)
     };
-    let take = Take::new(settings).unwrap();
+    Take::new(settings).unwrap()
+}
+
+/// A scene by structure from motion and stereo, and the same keyframes with true poses and exact depth; both begin at the first one.
+pub(crate) fn beside_truth(
+    (kind, name): (SceneKind, &str),
+    n_frames: u32,
+    sets: &[&str],
+) -> (Checkpoint, Checkpoint, Take) {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    let scene = format!("synthetic:{name}?frames={n_frames}&width=320&height=240");
+    let mut more = vec!["--steps", "1"];
+    more.extend(sets.iter().flat_map(|set| ["--set", set]));
+    replayed(&scene, "sfm", &out, &more);
+    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
+    assert_eq!(map.map_frame, None);
+    let take = filmed(kind, n_frames);
     let mut truth = exact(&map, &take);
     for pose in &mut truth.snapshot.poses {
         pose.world_from_cam = take.pose(frame_of(&take, pose));
     }
     truth.snapshot.scale = Scale::GIVEN;
+    (map, truth, take)
+}
+
+/// Walls of four corridors, mapped by the map's own poses and depth, beside those of the true poses and exact depth.
+#[test]
+fn after_a_loop_there_is_one_wall_and_it_is_where_it_was() {
+    let (map, truth, _) = beside_truth((SceneKind::Corridor, "corridor"), 220, &[]);
     let (found, wanted) = (grid_of(&map), grid_of(&truth));
     // Both begin at the first keyframe; what is left is the scale's error and the poses'. A cell counts as met by one beside it.
     let count = |a: &Grid, b: &Grid| {

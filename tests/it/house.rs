@@ -4,14 +4,12 @@ use std::collections::VecDeque;
 
 use glam::{DVec3, IVec2, IVec3};
 
-use crate::grid::{decided, exact, frame_of, is_near, replayed};
+use crate::grid::{beside_truth, decided, frame_of, is_near};
 use splat_mapper::eval::alignment::align;
 use splat_mapper::formats::planner_map;
 use splat_ros::odometry::beginning_at;
-use splat_slam::mapper::map_file::checkpoint;
-use splat_synth::settings::{SceneKind, SynthSettings};
+use splat_synth::settings::SceneKind;
 use splat_synth::take::Take;
-use splat_types::snapshot::Scale;
 use splat_types::transform::Rigid;
 use splat_volume::field::{Distance, distances};
 use splat_volume::grid::{FREE, Grid, OCCUPIED};
@@ -58,28 +56,9 @@ fn reached(grid: &Grid, from: IVec2, is_open: &dyn Fn(IVec2) -> bool) -> Vec<IVe
 
 /// By its own poses and depth, and by true ones; both begin at the first keyframe.
 fn volumes() -> (Volume, Volume, Take) {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("out");
-    let scene = "synthetic:house?frames=132&width=320&height=240";
-    replayed(scene, "sfm", &out, &["--steps", "1"]);
-    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
-    let settings = SynthSettings {
-        n_frames: 132,
-        width_px: 320,
-        height_px: 240,
-        ..SynthSettings::of(SceneKind::House)
-    };
-    let take = Take::new(settings).unwrap();
-    let mut truth = exact(&map, &take);
-    for pose in &mut truth.snapshot.poses {
-        pose.world_from_cam = take.pose(frame_of(&take, pose));
-    }
-    truth.snapshot.scale = Scale::GIVEN;
-    let [found, wanted] = [&map, &truth].map(|map| {
-        assert_eq!(map.map_frame, None);
-        planner_map::volume(map, &GridParams::default()).unwrap()
-    });
-    (found, wanted, take)
+    let (map, truth, take) = beside_truth((SceneKind::House, "house"), 132, &[]);
+    let volume = |map| planner_map::volume(map, &GridParams::default()).unwrap();
+    (volume(&map), volume(&truth), take)
 }
 
 #[test]
@@ -193,21 +172,8 @@ fn surfaces_and_distances(volume: &Volume, truth: &Volume) {
 fn a_start_at_the_door_waits_for_the_keyframe_that_decides() {
     // As live: three keyframes at once. Most of what they show is one wall, which two motions explain about equally well; the wrong one put the first
     // keyframes off by half of the path.
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("out");
-    let scene = "synthetic:house?frames=40&width=320&height=240";
     let small = ["select.batch_size=3", "select.batch_overlap=1"];
-    let mut more = vec!["--steps", "1"];
-    more.extend(small.iter().flat_map(|set| ["--set", set]));
-    replayed(scene, "sfm", &out, &more);
-    let map = checkpoint::read(&out.join("map.splatmap")).unwrap();
-    let settings = SynthSettings {
-        n_frames: 40,
-        width_px: 320,
-        height_px: 240,
-        ..SynthSettings::of(SceneKind::House)
-    };
-    let take = Take::new(settings).unwrap();
+    let (map, _, take) = beside_truth((SceneKind::House, "house"), 40, &small);
     let poses = &map.snapshot.poses;
     let own: Vec<Rigid> = poses.iter().map(|pose| pose.world_from_cam).collect();
     let wanted: Vec<Rigid> = poses

@@ -19,10 +19,11 @@ use splat_msgs::client::assembler::Assembler;
 use splat_msgs::map_messages::{KeyframeArray, SplatChunk, SplatManifest};
 use splat_msgs::ros;
 use splat_msgs::ros::standard::Path;
+use splat_msgs::services::SERVICES;
 use splat_msgs::type_hash::dds_type_name;
 use splat_ros::error::PublishError;
 use splat_ros::odometry;
-use splat_ros::output::Output;
+use splat_ros::output::{Output, topics};
 use splat_ros::params::PublishParams;
 use splat_types::snapshot::Snapshot;
 use splat_types::time::Stopwatch;
@@ -167,10 +168,11 @@ fn a_subscriber_that_was_there_first_receives_every_revision() {
         .history(true)
         .wait()
         .unwrap();
-    // One of the node, 17 of its publishers and 8 of its services, in any order. One that is declared while the history
-    // is asked for may come twice.
+    // One of the node, and those of its publishers and services, in any order. One that is declared while the history is
+    // asked for may come twice.
+    let n_tokens = 1 + topics().len() + SERVICES.len();
     let mut tokens = BTreeSet::new();
-    while tokens.len() < 26 {
+    while tokens.len() < n_tokens {
         let token = matching.recv_timeout(PATIENCE).unwrap().expect("no token");
         tokens.insert(token.key_expr().to_string());
     }

@@ -17,6 +17,18 @@ use crate::textures::Paint;
 const OUTER: DVec2 = DVec2::new(3.65, 3.15);
 const INNER: DVec2 = DVec2::new(1.85, 1.35);
 const HEIGHT: f64 = 2.5;
+/// What hangs on walls, in turn.
+pub(crate) const MOTIFS: [Painting; 9] = [
+    Painting::Page,
+    Painting::Map,
+    Painting::Blocks,
+    Painting::Circles,
+    Painting::Landscape,
+    Painting::Contours,
+    Painting::Glass,
+    Painting::Chart,
+    Painting::Triangles,
+];
 
 pub(crate) fn scene() -> Scene {
     let mut props = Props::new();
@@ -140,17 +152,6 @@ fn walls(props: &mut Props, side: u32, out: DVec2, inn: DVec2) {
 
 /// Doors, signs, posters and notice boards; every wall has its own order.
 fn hangings(props: &mut Props, side: u32, out: DVec2, inn: DVec2) {
-    const MOTIFS: [Painting; 9] = [
-        Painting::Page,
-        Painting::Map,
-        Painting::Blocks,
-        Painting::Circles,
-        Painting::Landscape,
-        Painting::Contours,
-        Painting::Glass,
-        Painting::Chart,
-        Painting::Triangles,
-    ];
     const SIGNS: [[&str; 2]; 4] = [
         ["ROOM 101", "LAB"],
         ["ROOM 112", "STORE"],

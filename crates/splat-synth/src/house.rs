@@ -5,6 +5,7 @@
 use glam::{DVec3, Vec2, Vec3};
 
 use crate::clutter::{ornament, plant};
+use crate::corridor::MOTIFS;
 use crate::furniture::{oak, shelf, sideboard, sofa, walnut};
 use crate::light::{Lamp, Light};
 use crate::lighting::lit;
@@ -169,17 +170,6 @@ fn partition(props: &mut Props) {
 
 /// Paintings along a wall, no two alike.
 fn hangings(props: &mut Props, [x, y]: [f64; 2], facing: f64, wall: u32) {
-    const MOTIFS: [Painting; 9] = [
-        Painting::Page,
-        Painting::Map,
-        Painting::Blocks,
-        Painting::Circles,
-        Painting::Landscape,
-        Painting::Contours,
-        Painting::Glass,
-        Painting::Chart,
-        Painting::Triangles,
-    ];
     let is_side = x.abs() < HALF_X - 0.1;
     for n in 0..4u32 {
         let id = hash(wall * 101 + n * 7 + 3);
