@@ -3,7 +3,7 @@
 use glam::{DVec3, IVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::distances::{max_distance, no_volume};
+use crate::distances::{GetDistancesResponse, max_distance, no_volume};
 use crate::obstacles::{MAX_ELLIPSOIDS, ellipsoid_array};
 use crate::shared_volume::SharedVolume;
 use splat_msgs::ellipsoid_message::EllipsoidArray;
@@ -85,6 +85,7 @@ macro_rules! refused {
 }
 
 refused!(
+    GetDistancesResponse,
     GetDistanceBoxResponse,
     GetEllipsoidsResponse,
     GetMeshResponse

@@ -32,15 +32,6 @@ pub struct GetDistancesResponse {
     pub known: Vec<bool>,
 }
 
-impl GetDistancesResponse {
-    pub(crate) fn refused(message: String) -> Self {
-        Self {
-            message,
-            ..Self::default()
-        }
-    }
-}
-
 pub(crate) fn no_volume() -> String {
     "there is no volume yet: status.warnings says why, if it is not to come".to_owned()
 }

@@ -73,14 +73,8 @@ pub(crate) fn ellipsoid_array(
 /// Middles of voxels that a surface goes through, in a region: of too many those nearest to its middle.
 pub(crate) fn voxel_cloud(volume: &SharedVolume, region: &Region, header: Header) -> PointCloud2 {
     let voxels = &volume.voxels;
-    let edge = voxels.size * f64::from(SIDE);
-    let (first, last) = ((region.low / edge).floor(), (region.high / edge).floor());
-    let is_near = |block: &IVec3| {
-        let block = block.as_dvec3();
-        block.cmpge(first).all() && block.cmple(last).all()
-    };
     let mut middles: Vec<DVec3> = Vec::new();
-    for block in voxels.indices().into_iter().filter(is_near) {
+    for block in voxels.indices_in(region.low, region.high, 0) {
         let Some(view) = voxels.block(block) else {
             continue;
         };

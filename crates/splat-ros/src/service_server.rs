@@ -12,7 +12,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::box_services::{self, Refused};
-use crate::distances::{self, GetDistancesRequest, GetDistancesResponse};
+use crate::distances;
 use crate::latched::LatchedStore;
 use crate::render_view::{Frames, RenderViewRequest, RenderViewResponse};
 use crate::shared_volume::SharedVolume;
@@ -152,7 +152,9 @@ impl ServiceServer {
             }),
             Kind::GetSplats => self.get_splats(question),
             Kind::RenderView => self.render_view(question),
-            Kind::GetDistances => self.get_distances(question),
+            Kind::GetDistances => self.of_volume(question, |volume, _, asked| {
+                distances::answer(volume, asked)
+            }),
             Kind::GetDistanceBox => self.of_volume(question, |volume, _, asked| {
                 box_services::distance_box(volume, asked)
             }),
@@ -291,13 +293,6 @@ impl ServiceServer {
             }
         };
         encoded(&response)
-    }
-
-    fn get_distances(&self, question: &[u8]) -> Vec<u8> {
-        let volume = self.latched.volume();
-        let asked = decoded::<GetDistancesRequest>(question);
-        let response = asked.and_then(|asked| distances::answer(volume.as_deref(), &asked));
-        encoded(&response.unwrap_or_else(GetDistancesResponse::refused))
     }
 
     /// What the volume and the published map say to a question.

@@ -52,16 +52,8 @@ pub fn mesh(voxels: &Voxels) -> Mesh {
 
 /// The surface in the blocks that a box touches.
 pub fn mesh_in(voxels: &Voxels, low: DVec3, high: DVec3) -> Mesh {
-    let edge = voxels.size * f64::from(SIDE);
     // A surface between two blocks belongs to the lower one.
-    let low = (low / edge).floor() - 1.0;
-    let high = (high / edge).floor();
-    let is_touched = |block: &IVec3| {
-        let block = block.as_dvec3();
-        block.cmpge(low).all() && block.cmple(high).all()
-    };
-    let mut indices = voxels.indices();
-    indices.retain(is_touched);
+    let indices = voxels.indices_in(low, high, 1);
     // Cubes reach into the next blocks. Those that are on disk are read once.
     let near = |block: &IVec3| {
         let block = *block;

@@ -7,11 +7,9 @@ use rayon::prelude::*;
 
 use crate::ellipsoids::{mean, opacity, own_axes};
 use crate::mesh::Mesh;
-use splat_types::splats::splats::Splats;
+use splat_types::splats::splats::{SH_C0, Splats};
 use splat_types::transform::Similarity;
 
-/// Spherical harmonic of degree 0.
-const SH_0: f64 = 0.282_094_791_773_878_14;
 /// Of vertices that no splat is near.
 const NO_COLOUR: [u8; 3] = [128; 3];
 /// Splats with less do not count.
@@ -98,7 +96,7 @@ impl Blob {
             mean: level_from_world.transform_point(mean(splats, ix)),
             whiten: DMat3::from_diagonal(1.0 / wide) * DMat3::from_quat(rotation.inverse()),
             opacity: opacity(splats, ix),
-            colour: DVec3::from_array(sh) * SH_0 + 0.5,
+            colour: DVec3::from_array(sh) * f64::from(SH_C0) + 0.5,
         }
     }
 }

@@ -111,6 +111,19 @@ impl Voxels {
         all
     }
 
+    /// Those that a box touches, in the same order; so many blocks more on its lower sides.
+    pub fn indices_in(&self, low: DVec3, high: DVec3, more_below: i32) -> Vec<IVec3> {
+        let edge = self.size * f64::from(SIDE);
+        let first = (low / edge).floor() - f64::from(more_below);
+        let last = (high / edge).floor();
+        let mut all = self.indices();
+        all.retain(|block| {
+            let block = block.as_dvec3();
+            block.cmpge(first).all() && block.cmple(last).all()
+        });
+        all
+    }
+
     pub fn voxel(&self, at: IVec3) -> Voxel {
         let index = at.div_euclid(IVec3::splat(SIDE));
         let block = self.blocks.get(index);

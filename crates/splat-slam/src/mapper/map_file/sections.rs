@@ -27,10 +27,7 @@ const IS_HELD_OUT: u32 = 1;
 /// Empty where there is none.
 pub(crate) fn map_frame_bytes(frame: Option<MapFrame>) -> Vec<u8> {
     let poses = frame.map(|frame| [frame.world_from_cam, frame.map_from_camera]);
-    let numbers = poses.into_iter().flatten().flat_map(|pose| {
-        let (q, t) = (pose.rotation, pose.translation);
-        [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
-    });
+    let numbers = poses.iter().flatten().flat_map(numbers_of);
     numbers.flat_map(f64::to_le_bytes).collect()
 }
 
@@ -39,20 +36,15 @@ pub(crate) fn parse_map_frame(mut content: &[u8]) -> Result<Option<MapFrame>, St
         return Ok(None);
     }
     let found = content.len();
-    let mut numbers = [0.0; 14];
-    let read = content.read_f64_into::<LittleEndian>(&mut numbers);
-    if read.is_err() || !content.is_empty() {
+    let (Ok(world_from_cam), Ok(map_from_camera), []) =
+        (read_pose(&mut content), read_pose(&mut content), content)
+    else {
         return Err(format!("{found} bytes, two poses have 112"));
-    }
-    let pose = |n: &[f64]| {
-        let rotation = DQuat::from_xyzw(n[1], n[2], n[3], n[0]);
-        Rigid::new(rotation, DVec3::new(n[4], n[5], n[6]))
     };
     let frame = MapFrame {
-        world_from_cam: pose(&numbers[..7]),
-        map_from_camera: pose(&numbers[7..]),
+        world_from_cam,
+        map_from_camera,
     };
-    let is_sound = |pose: &Rigid| pose.is_finite() && (pose.rotation.length() - 1.0).abs() < 1e-6;
     if is_sound(&frame.world_from_cam) && is_sound(&frame.map_from_camera) {
         Ok(Some(frame))
     } else {
@@ -60,17 +52,31 @@ pub(crate) fn parse_map_frame(mut content: &[u8]) -> Result<Option<MapFrame>, St
     }
 }
 
+/// Quaternion from w on, then the translation.
+fn numbers_of(pose: &Rigid) -> [f64; 7] {
+    let (q, t) = (pose.rotation, pose.translation);
+    [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
+}
+
+fn read_pose(bytes: &mut &[u8]) -> io::Result<Rigid> {
+    let mut numbers = [0.0; 7];
+    bytes.read_f64_into::<LittleEndian>(&mut numbers)?;
+    let [w, x, y, z, tx, ty, tz] = numbers;
+    let rotation = DQuat::from_xyzw(x, y, z, w);
+    Ok(Rigid::new(rotation, DVec3::new(tx, ty, tz)))
+}
+
+fn is_sound(pose: &Rigid) -> bool {
+    pose.is_finite() && (pose.rotation.length() - 1.0).abs() < 1e-6
+}
+
 pub(crate) fn keyframe_bytes(poses: &[KeyframePose]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(poses.len() * KEYFRAME_BYTES);
     for pose in poses {
-        let (q, t, k) = (
-            pose.world_from_cam.rotation,
-            pose.world_from_cam.translation,
-            &pose.intrinsics,
-        );
+        let k = &pose.intrinsics;
         bytes.extend_from_slice(&pose.keyframe_id.to_le_bytes());
         bytes.extend_from_slice(&pose.stamp.nanos.to_le_bytes());
-        for number in [q.w, q.x, q.y, q.z, t.x, t.y, t.z] {
+        for number in numbers_of(&pose.world_from_cam) {
             bytes.extend_from_slice(&number.to_le_bytes());
         }
         bytes.extend_from_slice(&k.width_px.to_le_bytes());
@@ -93,8 +99,7 @@ pub(crate) fn parse_keyframes(content: &[u8]) -> Result<Vec<KeyframePose>, Strin
     let mut poses = Vec::with_capacity(rows.len());
     for row in rows {
         let pose = parse_keyframe(row).map_err(|e| e.to_string())?;
-        let lengths_fit = (pose.world_from_cam.rotation.length() - 1.0).abs() < 1e-6;
-        if !pose.world_from_cam.is_finite() || !lengths_fit || !pose.intrinsics.is_plausible() {
+        if !is_sound(&pose.world_from_cam) || !pose.intrinsics.is_plausible() {
             return Err(format!(
                 "keyframe {} has no usable pose or intrinsics",
                 pose.keyframe_id
@@ -108,9 +113,7 @@ pub(crate) fn parse_keyframes(content: &[u8]) -> Result<Vec<KeyframePose>, Strin
 fn parse_keyframe(mut row: &[u8]) -> io::Result<KeyframePose> {
     let keyframe_id = row.read_u32::<LittleEndian>()?;
     let stamp = Stamp::from_nanos(row.read_i64::<LittleEndian>()?);
-    let mut numbers = [0.0; 7];
-    row.read_f64_into::<LittleEndian>(&mut numbers)?;
-    let [w, x, y, z, tx, ty, tz] = numbers;
+    let world_from_cam = read_pose(&mut row)?;
     let (width_px, height_px) = (
         row.read_u32::<LittleEndian>()?,
         row.read_u32::<LittleEndian>()?,
@@ -121,7 +124,7 @@ fn parse_keyframe(mut row: &[u8]) -> io::Result<KeyframePose> {
     Ok(KeyframePose {
         keyframe_id,
         stamp,
-        world_from_cam: Rigid::new(DQuat::from_xyzw(x, y, z, w), DVec3::new(tx, ty, tz)),
+        world_from_cam,
         intrinsics: Intrinsics {
             width_px,
             height_px,
