@@ -28,6 +28,9 @@ pub struct Evaluation {
     pub ate_rmse: Option<f64>,
     /// The same as a share of the largest distance between two reference positions.
     pub ate_percent_of_extent: Option<f64>,
+    /// Root mean square distance of positions after alignment by a rigid motion alone, in units of the reference: the run's
+    /// own metres count. `None` where the run has none.
+    pub ate_se3_rmse: Option<f64>,
     /// Mean angle between orientations after the same alignment.
     pub rotation_mean_deg: Option<f64>,
     /// Root mean square error of the motion from each keyframe to the next: its length, in units of the reference,
@@ -51,11 +54,13 @@ pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalErro
     let keyframes = read_poses(&keyframes_path)?;
     let truth = read_reference(reference)?;
     let report_path = run_dir.join("report.json");
-    let quality = if report_path.exists() {
-        Some(Report::read(&report_path)?.quality)
+    let report = if report_path.exists() {
+        Some(Report::read(&report_path)?)
     } else {
         None
     };
+    let metres_per_unit = report.as_ref().and_then(|r| r.scale.metres_per_unit);
+    let quality = report.map(|report| report.quality);
     let evaluation = compare(&keyframes, &truth);
     if evaluation.registered == 0 {
         return Err(EvalError::NothingInCommon {
@@ -65,10 +70,33 @@ pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalErro
             path: reference.to_owned(),
         });
     }
+    let ate_se3_rmse = metres_per_unit.and_then(|m| ate_se3(&keyframes, &truth, m));
     Ok(Evaluation {
         quality,
+        ate_se3_rmse,
         ..evaluation
     })
+}
+
+/// Root mean square distance of positions in metres after the best rigid motion.
+fn ate_se3(keyframes: &[TimedPose], reference: &[TimedPose], metres_per_unit: f64) -> Option<f64> {
+    let offset_nanos = stamp_offset_nanos(keyframes, reference, TOLERANCE_SECS);
+    let keyframes = shifted(keyframes, offset_nanos);
+    let pairs = associate(&keyframes, reference, TOLERANCE_SECS);
+    let own: Vec<Rigid> = pairs.iter().map(|&(ix, _)| keyframes[ix].pose).collect();
+    let truth: Vec<Rigid> = pairs.iter().map(|&(_, ix)| reference[ix].pose).collect();
+    // The best turn about the middles is the same whatever the scale.
+    let turn = align(&own, &truth).ok()?.reference_from_estimate.rotation;
+    let middle = |poses: &[Rigid]| {
+        let sum: DVec3 = poses.iter().map(|pose| pose.translation).sum();
+        sum / poses.len() as f64
+    };
+    let (own_middle, true_middle) = (middle(&own), middle(&truth));
+    let off = own.iter().zip(&truth).map(|(own, truth)| {
+        let turned = turn * (own.translation - own_middle) * metres_per_unit;
+        turned.distance(truth.translation - true_middle)
+    });
+    Some(rmse(off))
 }
 
 /// The figures for two trajectories in order of time.
@@ -83,6 +111,7 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         reference: reference.len(),
         ate_rmse: None,
         ate_percent_of_extent: None,
+        ate_se3_rmse: None,
         rotation_mean_deg: None,
         rpe_translation: None,
         rpe_rotation_deg: None,
@@ -202,6 +231,13 @@ impl std::fmt::Display for Evaluation {
             figure(self.rpe_translation),
             figure(self.rpe_rotation_deg)
         )?;
+        if let Some(metres) = self.ate_se3_rmse {
+            writeln!(
+                f,
+                "ATE in metres    {} RMSE (keyframes, aligned by a rigid motion, at the run's own scale)",
+                figure(Some(metres))
+            )?;
+        }
         writeln!(
             f,
             "aligned scale    {} units of the reference per unit of the run",
