@@ -75,6 +75,12 @@ pub struct FrameCounts {
     pub dropped: u64,
     pub undecodable: u64,
     pub out_of_order: u64,
+    /// That no depth image belongs to, of a source that has some.
+    #[serde(default)]
+    pub without_depth: u64,
+    /// That no image of the second camera belongs to, of a stereo pair.
+    #[serde(default)]
+    pub without_second: u64,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -247,6 +253,8 @@ impl FrameCounts {
             received,
             undecodable,
             out_of_order,
+            without_depth,
+            without_second,
             dropped: missed,
             ..
         } = *counts;
@@ -255,6 +263,8 @@ impl FrameCounts {
             dropped: dropped + missed,
             undecodable,
             out_of_order,
+            without_depth,
+            without_second,
         }
     }
 }

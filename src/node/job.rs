@@ -19,7 +19,7 @@ use splat_geometry::foundation::model::Model;
 use splat_geometry::ground_truth::model::GroundTruthModel;
 use splat_geometry::model::GeometryModel;
 use splat_geometry::sfm::estimator::Sfm;
-use splat_io::frame_source::{Source, SourceCounts};
+use splat_io::frame_source::{MetricInput, Source, SourceCounts};
 use splat_ros::output::Output;
 use splat_ros::publisher::Publisher;
 use splat_ros::transport::Transport;
@@ -177,18 +177,35 @@ impl std::fmt::Debug for Outcome {
 /// The geometry model that the parameters name, and where its lengths come from.
 pub(crate) fn model(
     params: &Params,
-    truth_extent: Option<f64>,
+    source: &dyn Source,
 ) -> anyhow::Result<(Box<dyn GeometryModel>, Scale)> {
+    let sfm = || Sfm::new(&params.sfm, &params.mvs, params.seed);
+    let input = source.metric_input();
     match params.geometry.as_str() {
-        "sfm" => Ok((
-            Box::new(Sfm::new(&params.sfm, &params.mvs, params.seed)?),
-            Scale::UP_TO_SCALE,
-        )),
+        "rgbd" if input != MetricInput::Depth => bail!(
+            "--geometry rgbd: the source has no depth images; name their topic by source.depth_topic, or use --geometry sfm, which needs none"
+        ),
+        "stereo" if input != MetricInput::Stereo => bail!(
+            "--geometry stereo: the source has no second camera; name its topic by source.second_image_topic (CameraInfo beside it, with the baseline in P, or /tf_static says where it is), or use --geometry sfm, which needs none"
+        ),
+        "auto" | "rgbd" if input == MetricInput::Depth => {
+            tracing::info!(
+                "geometry rgbd: poses, depth and the metre by colour and depth images; --geometry sfm uses colour alone"
+            );
+            Ok((Box::new(sfm()?.with_sensors()), Scale::UP_TO_SCALE))
+        }
+        "auto" | "stereo" if input == MetricInput::Stereo => {
+            tracing::info!(
+                "geometry stereo: poses, depth and the metre by both cameras; --geometry sfm uses the first alone"
+            );
+            Ok((Box::new(sfm()?.with_sensors()), Scale::UP_TO_SCALE))
+        }
+        "auto" | "sfm" => Ok((Box::new(sfm()?), Scale::UP_TO_SCALE)),
         "ground_truth" => {
             let known = GroundTruthModel::new(
                 params.ground_truth.clone(),
                 (&params.sfm, &params.mvs),
-                truth_extent,
+                source.truth_extent(),
                 params.seed,
             )?;
             // Windows have units of their own, as a foundation model's have.
@@ -211,7 +228,9 @@ pub(crate) fn model(
                 let foundation = FoundationModel::of(network, &params.onnx, aligner, free);
                 Ok((Box::new(foundation), Scale::UP_TO_SCALE))
             }
-            None => bail!("{name:?} is no geometry; expected sfm, ground_truth or onnx:FILE"),
+            None => bail!(
+                "{name:?} is no geometry; expected auto, sfm, rgbd, stereo, ground_truth or onnx:FILE"
+            ),
         },
     }
 }

@@ -83,7 +83,7 @@ pub fn run(mut job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Resul
 }
 
 fn run_once(job: Job, on_progress: &mut dyn FnMut(Progress)) -> anyhow::Result<End> {
-    let (model, scale) = model(&job.params, job.source.truth_extent())?;
+    let (model, scale) = model(&job.params, &*job.source)?;
     run_with(model, scale, job, on_progress)
 }
 

@@ -32,8 +32,9 @@ pub struct Params {
     /// The same input gives the same map on the same adapter; false lets wgpu add floats in any order, where the
     /// adapter can.
     pub deterministic: bool,
-    /// sfm, onnx:FILE (a network as docs/MODELS.md describes it), or ground_truth (recorded poses, and depth by
-    /// stereo where none is recorded, plus the noise under ground_truth.*).
+    /// sfm (colour images alone), rgbd (depth images, too), stereo (a pair of cameras), onnx:FILE (a network as docs/MODELS.md describes it), or
+    /// ground_truth (recorded poses, and depth by stereo where none is recorded, plus the noise under ground_truth.*);
+    /// auto takes rgbd or stereo where the source has that, else sfm.
     pub geometry: String,
     /// One thread, stage after stage, for tests and bisecting; the same map as with threads.
     pub sequential: bool,
@@ -85,7 +86,7 @@ impl Default for Params {
             seed: 0,
             backend: Backend::Auto,
             deterministic: true,
-            geometry: "sfm".to_owned(),
+            geometry: "auto".to_owned(),
             sequential: false,
             use_sim_time: false,
             engine: EngineParams::default(),

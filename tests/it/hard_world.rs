@@ -109,6 +109,7 @@ pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrin
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out: false,
         };
         Arc::new(Keyframe {

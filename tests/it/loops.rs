@@ -66,6 +66,7 @@ pub(crate) fn film(scene: &str, stride: u32) -> Filmed {
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out: false,
         };
         filmed.keyframes.push(Arc::new(Keyframe {

@@ -70,6 +70,7 @@ mod scene_formats;
 mod scene_points;
 mod scene_reference;
 mod scenes;
+mod sensors;
 mod sent_corrections;
 mod sent_submaps;
 mod sfm;

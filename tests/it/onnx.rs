@@ -274,6 +274,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out: false,
         };
         Arc::new(Keyframe {

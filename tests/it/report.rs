@@ -124,6 +124,8 @@ pub(crate) fn sample_report() -> Report {
             dropped: 0,
             undecodable: 1,
             out_of_order: 0,
+            without_depth: 0,
+            without_second: 0,
         },
         keyframes: KeyframeCounts {
             selected: 38,

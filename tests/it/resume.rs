@@ -85,6 +85,7 @@ fn elsewhere(frames: &[Frame]) -> Vec<Frame> {
         Frame {
             truth: frame.truth.map(|pose| there.transform_pose(&pose)),
             sensor_depth: depth,
+            second: None,
             ..frame.clone()
         }
     };

@@ -106,6 +106,7 @@ pub(crate) fn keyframe(
         truth: None,
         odometry: None,
         sensor_depth: None,
+        second: None,
         is_held_out: false,
     };
     Arc::new(Keyframe {

@@ -81,6 +81,7 @@ fn frames(settings: SynthSettings, numbers: Range<u32>) -> Vec<Frame> {
         truth: Some(take.pose(ix)),
         odometry: None,
         sensor_depth: None,
+        second: None,
         is_held_out: false,
     };
     numbers.map(frame).collect()

@@ -4,6 +4,7 @@ use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::covariance::Covariance;
 use splat_types::depth::DepthMap;
 use splat_types::load_shed::LoadShed;
+use splat_types::snapshot::ScaleSource;
 use splat_types::transform::Rigid;
 
 /// How far a view can be trusted.
@@ -124,8 +125,18 @@ pub struct GeometryBatch {
     pub is_loop: bool,
     /// Why keyframes are missing, one plain sentence, for status and errors.
     pub note: Option<String>,
+    /// What makes the metre the unit of the poses; `None` where a model knows them up to one factor, or knows metres always.
+    pub metric: Option<MetricUnit>,
     /// Live, since the start.
     pub load_shed: LoadShed,
+}
+
+/// A sensor that makes the metre the unit of a model's poses.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MetricUnit {
+    pub source: ScaleSource,
+    /// Standard deviation of all lengths in common, as a share of them.
+    pub relative_std: f64,
 }
 
 impl GeometryBatch {

@@ -40,14 +40,20 @@ pub fn compressed_into(
 
 /// A 16-bit grey PNG of millimetres.
 pub fn depth_png(bytes: &[u8]) -> Result<DepthMap, DecodeError> {
+    let (width, height, values) = grey16_png(bytes)?;
+    let depth = values.into_iter().map(depth_of_millimetres);
+    Ok(depth_map(width, height, depth.collect()))
+}
+
+/// Width, height and values of a 16-bit grey PNG.
+pub fn grey16_png(bytes: &[u8]) -> Result<(u32, u32, Vec<u16>), DecodeError> {
     let image::DynamicImage::ImageLuma16(image) = image_of(bytes)? else {
         return Err(DecodeError::Compressed {
             found_bytes: bytes.len(),
             reason: "depth that is no 16-bit grey PNG".to_owned(),
         });
     };
-    let depth = image.pixels().map(|p| depth_of_millimetres(p.0[0]));
-    Ok(depth_map(image.width(), image.height(), depth.collect()))
+    Ok((image.width(), image.height(), image.into_raw()))
 }
 
 fn image_of(bytes: &[u8]) -> Result<image::DynamicImage, DecodeError> {

@@ -50,6 +50,17 @@ pub fn lens_of_camera_info(info: &CameraInfo, is_rectified: bool) -> Result<Came
     })
 }
 
+/// image_proc publishes undistorted images as `image_rect` and `image_rect_color` beside the CameraInfo of the raw ones.
+pub fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
+    let base = image_topic
+        .strip_suffix("/compressed")
+        .unwrap_or(image_topic);
+    base.rsplit('/')
+        .next()
+        .is_some_and(|name| name.starts_with("image_rect"))
+        && info.p[0] > 0.0
+}
+
 /// What `intrinsics.json` of a folder of images holds; other keys are ignored.
 #[derive(Debug, Deserialize)]
 struct IntrinsicsFile {

@@ -19,10 +19,24 @@ pub struct SourceCounts {
     pub out_of_order: u64,
     /// Made and never looked at: the driver skipped their numbers, or they came faster than they were taken.
     pub dropped: u64,
+    /// Frames that no depth image belongs to, of a source that has some.
+    pub without_depth: u64,
+    /// Frames that no image of the second camera belongs to, of a stereo pair.
+    pub without_second: u64,
     /// Times that a camera stopped and was opened again.
     pub interruptions: u64,
     /// The fault that ended the input early, for example a truncated recording. Frames before it stay in use.
     pub fault: Option<String>,
+}
+
+/// What frames bring that shows lengths in metres.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MetricInput {
+    None,
+    /// Depth that a sensor measured, `Frame::sensor_depth`.
+    Depth,
+    /// The image of a second camera, `Frame::second`.
+    Stereo,
 }
 
 /// What a look for the next frame found.
@@ -73,6 +87,11 @@ pub trait Source: Send {
 
     /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
     fn truth_extent(&self) -> Option<f64>;
+
+    /// What the frames bring besides one colour image that shows lengths.
+    fn metric_input(&self) -> MetricInput {
+        MetricInput::None
+    }
 
     /// Sparse points of the scene in the frame of the true poses, read when they are asked for; empty where it has none.
     fn sparse_points(&self) -> Result<Vec<SparsePoint>, SourceError> {

@@ -13,7 +13,7 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::calibration::lens_of_json;
 use crate::error::SourceError;
-use crate::frame_source::{Source, SourceCounts};
+use crate::frame_source::{MetricInput, Source, SourceCounts};
 use crate::ground_truth::{Track, half_interval, stamp_of_decimal, track_of_tum};
 use crate::intake::{Extras, Intake};
 use crate::params::SourceParams;
@@ -195,10 +195,10 @@ impl ImagesSource {
             Ok(image) => {
                 let extras = Extras {
                     truth: entry.truth,
-                    odometry: None,
                     sensor_depth: self.depth_of(entry),
                     lens: entry.lens,
                     is_held_out: entry.is_held_out,
+                    ..Extras::default()
                 };
                 self.intake.frame(arrival, image, extras)
             }
@@ -286,6 +286,15 @@ impl Source for ImagesSource {
 
     fn n_photos(&self) -> Option<u64> {
         self.len_hint()
+    }
+
+    fn metric_input(&self) -> MetricInput {
+        let mut entries = self.entries.as_slice().iter();
+        if entries.any(|entry| entry.depth.is_some()) {
+            MetricInput::Depth
+        } else {
+            MetricInput::None
+        }
     }
 
     fn truth_extent(&self) -> Option<f64> {

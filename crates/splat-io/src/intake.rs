@@ -12,7 +12,7 @@ use splat_image::pixel_format::resize;
 use splat_image::undistort::Undistorter;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::depth::DepthMap;
-use splat_types::frame::Frame;
+use splat_types::frame::{Frame, SecondImage};
 use splat_types::image::{Filter, Resampler, RgbImage};
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
@@ -23,6 +23,7 @@ pub struct Extras {
     pub truth: Option<Rigid>,
     pub odometry: Option<Rigid>,
     pub sensor_depth: Option<DepthMap>,
+    pub second: Option<SecondImage>,
     /// This image's own lens, where the images of an input differ; their sizes may then differ, too.
     pub lens: Option<CameraModel>,
     pub is_held_out: bool,
@@ -95,13 +96,22 @@ impl Intake {
         self.counts.dropped += n_images;
     }
 
+    /// The frame that comes next goes without the depth image that its source has a topic for.
+    pub fn without_depth(&mut self) {
+        self.counts.without_depth += 1;
+    }
+
+    /// The frame that comes next goes without an image of the second camera.
+    pub fn without_second(&mut self) {
+        self.counts.without_second += 1;
+    }
+
     /// The camera stopped and will be opened again.
     pub fn interrupted(&mut self) {
         self.counts.interruptions += 1;
     }
 
     /// Time begins anew: the next image may have any stamp.
-    #[cfg(feature = "ros2")]
     pub fn begin_anew(&mut self) {
         self.last_stamp = None;
     }
@@ -211,6 +221,7 @@ impl Intake {
             truth: extras.truth,
             odometry: extras.odometry,
             sensor_depth,
+            second: extras.second.map(Arc::new),
             is_held_out: extras.is_held_out,
         }
     }

@@ -30,6 +30,8 @@ pub mod intake;
 
 pub mod ros_image;
 
+mod compressed_depth;
+
 mod small_file;
 
 pub mod ground_truth;
@@ -39,6 +41,8 @@ mod bag;
 pub mod survey;
 
 pub mod camera_info;
+
+pub mod second_camera;
 
 pub mod topics;
 

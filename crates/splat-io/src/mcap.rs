@@ -8,16 +8,20 @@ use std::path::Path;
 use crate::bag::{Bag, files_of, not_mcap};
 use crate::camera_info;
 use crate::error::SourceError;
-use crate::frame_source::{Source, SourceCounts};
+use crate::frame_source::{MetricInput, Source, SourceCounts};
 use crate::ground_truth::{GroundTruth, Odometry, half_interval};
 use crate::intake::{Arrival, Extras, Intake};
 use crate::params::SourceParams;
+use crate::ros_image::decode_into;
+use crate::second_camera::SecondCamera;
 use crate::survey::{Survey, header_stamp};
-use crate::topics::{depth_topic_of, image_topic_of, lens_of, odometry_of, truth_of};
+use crate::topics::{
+    depth_topic_of, image_topic_of, lens_of, odometry_of, second_topic_of, truth_of,
+};
 use splat_image::jpeg::decoder::Jpeg;
 use splat_msgs::ros::{self, CompressedImage, Image};
 use splat_types::depth::DepthMap;
-use splat_types::frame::Frame;
+use splat_types::frame::{Frame, SecondImage};
 use splat_types::image::RgbImage;
 use splat_types::time::Stamp;
 
@@ -38,7 +42,23 @@ struct Waiting {
 struct ImageTopics {
     image: String,
     is_compressed: bool,
-    depth: Option<String>,
+    depth: Option<DepthTopic>,
+    second: Option<PairedTopic>,
+}
+
+#[derive(Debug)]
+struct PairedTopic {
+    name: String,
+    within_nanos: u64,
+    camera: SecondCamera,
+}
+
+#[derive(Debug)]
+struct DepthTopic {
+    name: String,
+    is_compressed: bool,
+    /// Depth belongs to the image whose stamp is nearest, if it is as near as that.
+    within_nanos: u64,
 }
 
 #[derive(Debug)]
@@ -52,6 +72,8 @@ pub struct McapSource {
     max_frames: u64,
     images: VecDeque<Waiting>,
     depths: VecDeque<Waiting>,
+    /// Of the second camera.
+    seconds: VecDeque<Waiting>,
     is_read: bool,
     jpeg: Jpeg,
     intake: Intake,
@@ -78,7 +100,24 @@ impl McapSource {
                 "more poses than are kept: frames late in the recording have no ground truth"
             );
         }
-        let depth_topic = depth_topic_of(&survey, params);
+        let depth_topic = depth_topic_of(&survey, params).map(|name| DepthTopic {
+            is_compressed: survey
+                .topics
+                .get(&name)
+                .is_some_and(|topic| topic.is_compressed()),
+            within_nanos: (1e9 * params.depth_tolerance) as u64,
+            name,
+        });
+        let second = second_topic_of(&survey, &image_topic, params).map(|topic| PairedTopic {
+            name: topic.name,
+            within_nanos: (1e9 * params.stereo_tolerance) as u64,
+            camera: SecondCamera::new(
+                params,
+                topic.lens,
+                topic.second_from_first,
+                topic.is_compressed,
+            ),
+        });
         let lens = match camera_info::of_url(&params.camera_info_url)? {
             Some((_, lens)) => Some(lens),
             None => lens_of(&survey, &image_topic, params),
@@ -101,10 +140,12 @@ impl McapSource {
                 image: image_topic,
                 is_compressed,
                 depth: depth_topic,
+                second,
             },
             max_frames: params.max_frames,
             images: VecDeque::new(),
             depths: VecDeque::new(),
+            seconds: VecDeque::new(),
             is_read: false,
             jpeg: Jpeg::default(),
             intake: Intake::new(params, lens),
@@ -125,33 +166,42 @@ impl McapSource {
                 return;
             }
         };
-        let waiting = if message.channel.topic == self.topics.image {
-            &mut self.images
-        } else if Some(&message.channel.topic) == self.topics.depth.as_ref() {
-            &mut self.depths
-        } else {
-            return;
+        let topic = &message.channel.topic;
+        let is_depth = self.topics.depth.as_ref().is_some_and(|d| d.name == *topic);
+        let is_second = self
+            .topics
+            .second
+            .as_ref()
+            .is_some_and(|s| s.name == *topic);
+        let waiting = match topic {
+            name if *name == self.topics.image => &mut self.images,
+            _ if is_depth => &mut self.depths,
+            _ if is_second => &mut self.seconds,
+            _ => return,
         };
         let stamp = header_stamp(message.payload, message.log_nanos);
         waiting.push_back(Waiting {
             stamp,
             payload: message.payload.to_vec(),
         });
-        while self.depths.len() > MAX_AHEAD
-            || (self.depths.len() > 1 && bytes_of(&self.depths) > MAX_AHEAD_BYTES)
-        {
-            self.depths.pop_front();
+        for beside in [&mut self.depths, &mut self.seconds] {
+            while beside.len() > MAX_AHEAD
+                || (beside.len() > 1 && bytes_of(beside) > MAX_AHEAD_BYTES)
+            {
+                beside.pop_front();
+            }
         }
     }
 
-    /// The oldest image, once its depth map is here or will not come.
+    /// The oldest image, once what goes with it is here or will not come.
     fn take_ready(&mut self) -> Option<Waiting> {
         let stamp = self.images.front()?.stamp;
-        let newest_depth = self.depths.iter().filter_map(|depth| depth.stamp).max();
+        let newest = |beside: &VecDeque<Waiting>| beside.iter().filter_map(|w| w.stamp).max();
+        let has_depth = self.topics.depth.is_none() || newest(&self.depths) >= stamp;
+        let has_second = self.topics.second.is_none() || newest(&self.seconds) >= stamp;
         let is_ready = self.is_read
-            || self.topics.depth.is_none()
             || stamp.is_none()
-            || newest_depth >= stamp
+            || (has_depth && has_second)
             || self.images.len() > MAX_AHEAD
             || bytes_of(&self.images) > MAX_AHEAD_BYTES;
         if is_ready {
@@ -185,19 +235,8 @@ impl McapSource {
 
     fn frame_with(&mut self, arrival: Arrival, image: RgbImage) -> Option<Frame> {
         let truth = self.truth.at(arrival.stamp, self.truth_within_nanos);
-        let depth = self
-            .depths
-            .iter()
-            .find(|depth| depth.stamp == Some(arrival.stamp));
-        let sensor_depth = match depth.map(|depth| depth_of(&depth.payload)) {
-            Some(Ok(depth)) => Some(depth),
-            Some(Err(reason)) => {
-                self.intake
-                    .warn_once("depth", &format!("depth maps are left out: {reason}"));
-                None
-            }
-            None => None,
-        };
+        let sensor_depth = self.depth_at(arrival.stamp);
+        let second = self.second_at(arrival.stamp);
         self.intake.frame(
             arrival,
             image,
@@ -205,10 +244,48 @@ impl McapSource {
                 truth,
                 odometry: self.odometry.at(arrival.stamp),
                 sensor_depth,
+                second,
                 ..Extras::default()
             },
         )
     }
+}
+
+impl McapSource {
+    /// The depth map that is nearest in time, if it is near enough. Images without one are counted.
+    fn depth_at(&mut self, stamp: Stamp) -> Option<DepthMap> {
+        let topic = self.topics.depth.as_ref()?;
+        let nearest = nearest(&self.depths, stamp, topic.within_nanos);
+        match nearest.map(|depth| depth_of(&depth.payload, topic.is_compressed)) {
+            Some(Ok(depth)) => return Some(depth),
+            Some(Err(reason)) => {
+                let text = format!("depth images are left out: {reason}");
+                self.intake.warn_once("depth", &text);
+            }
+            None => (),
+        }
+        self.intake.without_depth();
+        None
+    }
+
+    /// What the second camera saw at the same time. Images without it are counted.
+    fn second_at(&mut self, stamp: Stamp) -> Option<SecondImage> {
+        let topic = self.topics.second.as_ref()?;
+        let nearest = nearest(&self.seconds, stamp, topic.within_nanos);
+        let second = nearest.map(|second| topic.camera.image(stamp, second.payload.clone()));
+        if second.is_none() {
+            self.intake.without_second();
+        }
+        second
+    }
+}
+
+/// The message whose stamp is nearest, if it is near enough.
+fn nearest(waiting: &VecDeque<Waiting>, stamp: Stamp, within_nanos: u64) -> Option<&Waiting> {
+    let off = |other: &Waiting| Some(other.stamp?.nanos.abs_diff(stamp.nanos));
+    let near = waiting.iter().filter_map(|w| Some((off(w)?, w)));
+    let nearest = near.min_by_key(|(nanos, _)| *nanos)?;
+    (nearest.0 <= within_nanos).then_some(nearest.1)
 }
 
 impl Source for McapSource {
@@ -246,6 +323,14 @@ impl Source for McapSource {
     fn truth_extent(&self) -> Option<f64> {
         self.truth.extent()
     }
+
+    fn metric_input(&self) -> MetricInput {
+        match (&self.topics.depth, &self.topics.second) {
+            (Some(_), _) => MetricInput::Depth,
+            (None, Some(_)) => MetricInput::Stereo,
+            (None, None) => MetricInput::None,
+        }
+    }
 }
 
 fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
@@ -260,22 +345,12 @@ pub fn image_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String>
     Ok(out)
 }
 
-fn decode_into(
-    payload: &[u8],
-    is_compressed: bool,
-    jpeg: &mut Jpeg,
-    out: &mut RgbImage,
-) -> Result<(), String> {
+/// Of an Image, or of a CompressedImage of `compressedDepth`.
+pub fn depth_of(payload: &[u8], is_compressed: bool) -> Result<DepthMap, String> {
     if is_compressed {
         let message: CompressedImage = ros::decode(payload).map_err(|e| e.to_string())?;
-        return splat_image::codec::compressed_into(&message.data, jpeg, out)
-            .map_err(|e| e.to_string());
+        return crate::compressed_depth::compressed_depth(&message).map_err(|e| e.to_string());
     }
-    let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
-    crate::ros_image::raw_into(&message, out).map_err(|e| e.to_string())
-}
-
-pub fn depth_of(payload: &[u8]) -> Result<DepthMap, String> {
     let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
     crate::ros_image::depth(&message).map_err(|e| e.to_string())
 }

@@ -16,8 +16,20 @@ pub struct SourceParams {
     pub camera_info_url: String,
     /// PoseStamped ground truth (camera to world); empty takes the first found, tf next.
     pub pose_topic: String,
-    /// Sensor depth (16UC1 mm or 32FC1 m) for geometry ground_truth; empty takes the first found.
+    /// Depth images in the pixels of the colour camera (16UC1 mm or 32FC1 m, raw or compressedDepth) for geometry
+    /// rgbd and ground_truth; of a recording, empty takes the first found.
     pub depth_topic: String,
+    /// A depth image belongs to the colour image whose stamp is nearest, if they are no farther apart.
+    #[schemars(range(min = 0.0, max = 1.0), extend("unit" = "s"))]
+    pub depth_tolerance: f64,
+    /// Image topic of the second camera of a stereo pair, the right one; of a recording, empty takes the one whose name
+    /// says so (left and right, cam0 and cam1, infra1 and infra2), if its calibration states a baseline.
+    pub second_image_topic: String,
+    /// CameraInfo topic of the second camera; empty takes the one beside its image topic.
+    pub second_camera_info_topic: String,
+    /// Images of a pair whose stamps are farther apart are no pair.
+    #[schemars(range(min = 0.0, max = 0.1), extend("unit" = "s"))]
+    pub stereo_tolerance: f64,
     /// nav_msgs/Odometry; empty takes the first there is, else tf from the frame odom to the camera.
     pub odometry_topic: String,
     /// Images of a folder or scene to use: beginnings of their file names, separated by commas; empty = all.
@@ -51,6 +63,10 @@ impl Default for SourceParams {
             camera_info_url: String::new(),
             pose_topic: String::new(),
             depth_topic: String::new(),
+            depth_tolerance: 0.02,
+            second_image_topic: String::new(),
+            second_camera_info_topic: String::new(),
+            stereo_tolerance: 0.003,
             odometry_topic: String::new(),
             include_prefixes: String::new(),
             holdout_prefixes: String::new(),

@@ -1,9 +1,10 @@
 //! `sensor_msgs/Image` -> RGB images and depth maps.
 
 use splat_image::codec::{depth_map, depth_of_millimetres};
+use splat_image::jpeg::decoder::Jpeg;
 use splat_image::limits::{DecodeError, MAX_SIDE, empty, excerpt};
 use splat_image::pixel_format::{PixelFormat, Pixels, Rows, YuvColour, to_rgb};
-use splat_msgs::ros::Image;
+use splat_msgs::ros::{self, CompressedImage, Image};
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
 
@@ -31,6 +32,22 @@ fn pixels_of(image: &Image, format: PixelFormat) -> Pixels<'_> {
         step: image.step,
         bytes: &image.data,
     }
+}
+
+/// An `Image` or `CompressedImage` as RGB.
+pub(crate) fn decode_into(
+    payload: &[u8],
+    is_compressed: bool,
+    jpeg: &mut Jpeg,
+    out: &mut RgbImage,
+) -> Result<(), String> {
+    if is_compressed {
+        let message: CompressedImage = ros::decode(payload).map_err(|e| e.to_string())?;
+        return splat_image::codec::compressed_into(&message.data, jpeg, out)
+            .map_err(|e| e.to_string());
+    }
+    let message: Image = ros::decode(payload).map_err(|e| e.to_string())?;
+    raw_into(&message, out).map_err(|e| e.to_string())
 }
 
 /// Depth in metres; 0 where the sensor had none. Exact by agreement, so confidence is 1 wherever there is a value.

@@ -49,7 +49,8 @@ impl Topic {
     }
 
     pub(crate) fn is_depth(&self) -> bool {
-        DEPTH_ENCODINGS.contains(&self.encoding.as_str())
+        let encoding = self.encoding.split(';').next().unwrap_or_default();
+        DEPTH_ENCODINGS.contains(&encoding.trim())
     }
 }
 

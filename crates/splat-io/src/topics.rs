@@ -3,12 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::calibration::lens_of_camera_info;
+use crate::calibration::{is_rectified, lens_of_camera_info};
 use crate::error::SourceError;
 use crate::ground_truth::{GroundTruth, Odometry};
 use crate::params::SourceParams;
+use crate::second_camera::{is_pair, partner_of, second_from_first};
 use crate::survey::{Survey, Topic};
-use splat_msgs::ros::CameraInfo;
 use splat_types::camera::CameraModel;
 use splat_types::transform::Rigid;
 
@@ -83,6 +83,73 @@ pub(crate) fn depth_topic_of(survey: &Survey, params: &SourceParams) -> Option<S
     Some(params.depth_topic.clone())
 }
 
+/// The second camera of a stereo pair.
+pub(crate) struct SecondTopic {
+    pub(crate) name: String,
+    pub(crate) is_compressed: bool,
+    pub(crate) lens: CameraModel,
+    pub(crate) second_from_first: Rigid,
+}
+
+/// The topic of the second camera that the parameters name, or that goes with the image topic by its name; `None` where there is
+/// none, or nothing says how it is mounted.
+pub(crate) fn second_topic_of(
+    survey: &Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> Option<SecondTopic> {
+    let is_named = !params.second_image_topic.is_empty();
+    let name = if is_named {
+        params.second_image_topic.clone()
+    } else {
+        partner_of(image_topic)?
+    };
+    let complain = |what: &str| {
+        if is_named {
+            tracing::warn!("no stereo: {what}; found {}", survey.listing());
+        }
+    };
+    let Some(topic) = survey.topics.get(&name).filter(|topic| topic.is_image()) else {
+        complain(&format!("no images on {name:?}"));
+        return None;
+    };
+    let info_topic = |own: &str, image: &str| {
+        if own.is_empty() {
+            info_beside(image)
+        } else {
+            own.to_owned()
+        }
+    };
+    let first_topic = info_topic(&params.camera_info_topic, image_topic);
+    let second_topic = info_topic(&params.second_camera_info_topic, &name);
+    let infos = survey.infos.get(&first_topic);
+    let Some((first, second)) = infos.zip(survey.infos.get(&second_topic)) else {
+        complain(&format!(
+            "no CameraInfo on {first_topic:?} or {second_topic:?}"
+        ));
+        return None;
+    };
+    let lens = lens_of_camera_info(second, is_rectified(&name, second)).ok()?;
+    let by_calibration = second_from_first((image_topic, first), (&name, second));
+    let frames = survey.topics.get(image_topic).map(|first| &first.frame_id);
+    let by_transforms = || {
+        let second_from_first = survey.transforms.fixed(&topic.frame_id, frames?)?;
+        is_pair(&second_from_first).then_some(second_from_first)
+    };
+    let mounted = by_calibration.or_else(by_transforms);
+    if mounted.is_none() {
+        complain(&format!(
+            "neither P of {second_topic:?} nor /tf_static says how far the cameras are apart"
+        ));
+    }
+    Some(SecondTopic {
+        is_compressed: topic.is_compressed(),
+        lens,
+        second_from_first: mounted?,
+        name,
+    })
+}
+
 pub(crate) fn lens_of(
     survey: &Survey,
     image_topic: &str,
@@ -115,17 +182,6 @@ pub(crate) fn lens_of(
             tracing::warn!("camera counts as uncalibrated, {topic:?} says: {found}");
         })
         .ok()
-}
-
-/// image_proc publishes undistorted images as `image_rect` and `image_rect_color` beside the CameraInfo of the raw ones.
-pub fn is_rectified(image_topic: &str, info: &CameraInfo) -> bool {
-    let base = image_topic
-        .strip_suffix("/compressed")
-        .unwrap_or(image_topic);
-    base.rsplit('/')
-        .next()
-        .is_some_and(|name| name.starts_with("image_rect"))
-        && info.p[0] > 0.0
 }
 
 pub(crate) fn odometry_of(

@@ -159,6 +159,7 @@ impl Source for EndlessSource {
             truth: Some(pose),
             odometry: None,
             sensor_depth: Some(Arc::new(depth)),
+            second: None,
             is_held_out: false,
         })
     }

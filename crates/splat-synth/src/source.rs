@@ -108,6 +108,7 @@ impl Source for SyntheticSource {
             truth: Some(self.take.pose(ix)),
             odometry: self.odometry.get(ix as usize).copied(),
             sensor_depth,
+            second: None,
             is_held_out: false,
         })
     }

@@ -23,6 +23,17 @@ impl DepthMap {
         }
     }
 
+    /// So many pixels without depth.
+    pub fn empty(width_px: u32, height_px: u32) -> Self {
+        let n = width_px as usize * height_px as usize;
+        Self {
+            width_px,
+            height_px,
+            depth: vec![0.0; n],
+            confidence: vec![0.0; n],
+        }
+    }
+
     /// The same in another unit, `factor` of which make one of the old.
     pub fn scale(&mut self, factor: f64) {
         for value in &mut self.depth {

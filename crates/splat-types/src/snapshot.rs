@@ -23,16 +23,19 @@ pub enum ScaleSource {
     Height,
     /// A distance between two places of the camera that somebody measured.
     Baseline,
+    /// How far the cameras of a stereo pair are apart.
+    Stereo,
 }
 
 impl ScaleSource {
-    const ALL: [Self; 6] = [
+    const ALL: [Self; 7] = [
         Self::UpToScale,
         Self::Given,
         Self::Odometry,
         Self::Depth,
         Self::Height,
         Self::Baseline,
+        Self::Stereo,
     ];
 
     /// As reports have it.
@@ -44,6 +47,7 @@ impl ScaleSource {
             Self::Depth => "depth",
             Self::Height => "camera_height",
             Self::Baseline => "baseline",
+            Self::Stereo => "stereo",
         }
     }
 
@@ -56,6 +60,7 @@ impl ScaleSource {
             Self::Depth => 3,
             Self::Height => 4,
             Self::Baseline => 5,
+            Self::Stereo => 6,
         }
     }
 

@@ -107,7 +107,8 @@ fn settings_go_over_a_preset_and_a_preset_over_the_defaults() {
 }
 
 /// Keys whose default is another one since version 0.1.0.
-const NEW_DEFAULTS: [&str; 10] = [
+const NEW_DEFAULTS: [&str; 11] = [
+    "geometry",
     "map.max_splats",
     "map.snapshot_secs",
     "mcmc.noise",

@@ -286,6 +286,7 @@ fn problem(
         let seen = found.track.iter().map(|&(view, feature)| Observation {
             camera_ix: view as u32,
             pixel: matched.views[view].pixels[feature],
+            depth: None,
         });
         problem.add_point(found.point, seen);
     }

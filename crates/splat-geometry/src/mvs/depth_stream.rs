@@ -1,6 +1,7 @@
 //! A stream of posed keyframes -> verified depth of each as its neighbours come in. Bounded memory.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
@@ -13,6 +14,7 @@ use crate::mvs::view::{MvsView, Prepared, RawDepth};
 use splat_gpu::error::GpuError;
 use splat_types::camera::Intrinsics;
 use splat_types::depth::DepthMap;
+use splat_types::frame::SecondImage;
 use splat_types::transform::Rigid;
 
 /// Grey images and raw depth of the newest keyframes: up to 3 MB each at 320 pixels.
@@ -30,12 +32,24 @@ pub struct DepthStream {
 struct StoredDepth {
     prepared: Prepared,
     raw: RawDepth,
+    second: Option<Second>,
     /// What the raw depth rests on.
     swept_intrinsics: Intrinsics,
     sources: Vec<Source>,
     /// Sweep number, for forgetting the oldest.
     age: u64,
 }
+
+/// The second camera of a pair, which goes wherever the first one goes.
+#[derive(Debug)]
+struct Second {
+    prepared: Prepared,
+    raw: RawDepth,
+    first_from_second: Rigid,
+}
+
+/// Stands for the second camera of a pair among the sources of its first one; ids of keyframes are smaller.
+const SECOND: u32 = u32::MAX;
 
 /// A source as it was at the time of the sweep.
 #[derive(Debug)]
@@ -50,7 +64,7 @@ struct Source {
 pub struct SweepJob {
     keyframe_id: u32,
     reference: Prepared,
-    /// By keyframe.
+    /// By keyframe; `SECOND` for the pair's own.
     sources: Vec<(u32, Prepared)>,
     range: (f64, f64),
     params: MvsParams,
@@ -62,6 +76,8 @@ pub struct SweepJob {
 pub struct SweptDepth {
     keyframe_id: u32,
     raw: RawDepth,
+    /// Of the second camera.
+    second_raw: Option<RawDepth>,
     sources: Vec<Source>,
     matcher: Matcher,
 }
@@ -78,14 +94,21 @@ impl SweepJob {
         let (keyframe_id, n_sources) = (self.keyframe_id, self.sources.len());
         tracing::debug!(keyframe_id, n_sources, near, far, "sweep");
         let images: Vec<&Prepared> = self.sources.iter().map(|(_, source)| source).collect();
-        let raw = match SweepTask::new(&self.reference, &images, self.range, &self.params) {
+        let (range, params) = (self.range, &self.params);
+        let mut sweep = |reference: &Prepared, sources: &[&Prepared]| match SweepTask::new(
+            reference, sources, range, params,
+        ) {
             Some(task) => {
                 let winners = self.matcher.winners(&task, give_way);
                 give_way();
                 task.raw_depth(winners)
             }
-            None => RawDepth::empty(self.reference.intrinsics),
+            None => RawDepth::empty(reference.intrinsics),
         };
+        let raw = sweep(&self.reference, &images);
+        // The second camera's own depth, against the first alone, is what the pair's depth is checked by.
+        let second = self.sources.iter().find(|(id, _)| *id == SECOND);
+        let second_raw = second.map(|(_, second)| sweep(second, &[&self.reference]));
         let source = |(id, source): &(u32, Prepared)| Source {
             keyframe_id: *id,
             intrinsics: source.intrinsics,
@@ -94,6 +117,7 @@ impl SweepJob {
         SweptDepth {
             keyframe_id,
             raw,
+            second_raw,
             sources: self.sources.iter().map(source).collect(),
             matcher: self.matcher,
         }
@@ -134,6 +158,7 @@ impl DepthStream {
         let held = StoredDepth {
             prepared,
             raw,
+            second: None,
             swept_intrinsics,
             sources: Vec::new(),
             age: self.n_sweeps,
@@ -167,10 +192,15 @@ impl DepthStream {
         far: f64,
         neighbours: &[u32],
     ) -> Option<SweepJob> {
-        let reference = self.held.get(&keyframe_id)?.prepared.clone();
+        let held = self.held.get(&keyframe_id)?;
+        let reference = held.prepared.clone();
+        let own = held.second.as_ref();
+        let own = own.map(|second| (SECOND, second.prepared.clone()));
         let usable = neighbours.iter().filter(|id| **id != keyframe_id);
-        let sources: Vec<(u32, Prepared)> = usable
-            .filter_map(|id| Some((*id, self.held.get(id)?.prepared.clone())))
+        let others = usable.filter_map(|id| Some((*id, self.held.get(id)?.prepared.clone())));
+        let sources: Vec<(u32, Prepared)> = own
+            .into_iter()
+            .chain(others)
             .take(self.params.source_views)
             .collect();
         if sources.is_empty() {
@@ -193,6 +223,9 @@ impl DepthStream {
             held.swept_intrinsics = swept.raw.intrinsics;
             held.raw = swept.raw;
             held.sources = swept.sources;
+            if let Some((second, raw)) = held.second.as_mut().zip(swept.second_raw) {
+                second.raw = raw;
+            }
         }
     }
 
@@ -210,8 +243,17 @@ impl DepthStream {
             .filter_map(|id| self.held.get(id))
             .map(|other| (other.prepared.submap_from_cam, self.current_depth(other)))
             .collect();
-        let others: Vec<(Rigid, &RawDepth)> =
+        let mut others: Vec<(Rigid, &RawDepth)> =
             others.iter().map(|(pose, raw)| (*pose, raw)).collect();
+        // How a pair is mounted is known, unlike where another view is: its second camera confirms as much as two views.
+        let second = held.second.as_ref();
+        let second = second.map(|second| (second.prepared.submap_from_cam, &second.raw));
+        others.extend(
+            second
+                .into_iter()
+                .cycle()
+                .take(self.params.min_views.max(1)),
+        );
         Some(consistency::verify(
             (held.prepared.submap_from_cam, &raw),
             &others,
@@ -225,7 +267,35 @@ impl DepthStream {
             let grey = &held.prepared.grey;
             held.prepared.intrinsics = intrinsics.resized(grey.width as u32, grey.height as u32);
             held.prepared.submap_from_cam = submap_from_cam;
+            if let Some(second) = &mut held.second {
+                second.prepared.submap_from_cam = submap_from_cam * second.first_from_second;
+            }
         }
+    }
+
+    /// Gives a held keyframe the image of its second camera, in a submap whose unit is the metre.
+    pub fn pair(&mut self, keyframe_id: u32, second: &SecondImage) {
+        let Some((held, decoded)) = self.held.get_mut(&keyframe_id).zip(second.decoded()) else {
+            return;
+        };
+        let first_from_second = second.second_from_first.inverse();
+        let view = MvsView {
+            image: Arc::clone(&decoded.image),
+            intrinsics: decoded.intrinsics,
+            submap_from_cam: held.prepared.submap_from_cam * first_from_second,
+        };
+        let prepared = Prepared::new(&view, &self.params);
+        held.second = Some(Second {
+            raw: RawDepth::empty(prepared.intrinsics),
+            prepared,
+            first_from_second,
+        });
+    }
+
+    /// Whether a keyframe has the image of a second camera.
+    pub fn is_pair(&self, keyframe_id: u32) -> bool {
+        let held = self.held.get(&keyframe_id);
+        held.is_some_and(|held| held.second.is_some())
     }
 
     /// How far the revisions since the sweep have moved its pixels in its sources, in pixels of the depth map: above
@@ -277,6 +347,12 @@ impl DepthStream {
     #[cfg(test)]
     pub(crate) fn matcher(&self) -> Option<&Matcher> {
         self.matcher.as_ref()
+    }
+
+    /// Width and height of the depth map of a keyframe. `None`: not held.
+    pub fn size_of(&self, keyframe_id: u32) -> Option<(u32, u32)> {
+        let grey = &self.held.get(&keyframe_id)?.prepared.grey;
+        Some((grey.width as u32, grey.height as u32))
     }
 
     pub fn holds(&self, keyframe_id: u32) -> bool {

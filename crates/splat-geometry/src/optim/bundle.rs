@@ -166,6 +166,9 @@ fn total_cost(state: &State, flat: &Flat<'_>) -> f64 {
                 scale * image.distance_squared(seen.pixel)
             });
             product *= 1.0 + share;
+            if let Some(depth) = seen.depth.filter(|_| p.z > 1e-9) {
+                product *= 1.0 + scale * depth.residual_px(p.z).powi(2);
+            }
             if product > 1e100 {
                 logs += f64::ln(product);
                 product = 1.0;

@@ -9,6 +9,7 @@ use crate::optim::bundle::problem::{Camera, Observation, Problem, Settings};
 use crate::optim::pose_covariance::pose_information;
 use crate::sfm::landmarks::filter;
 use crate::sfm::limits::Limits;
+use crate::sfm::metric_submap::make_metric;
 use crate::sfm::params::LocalBaPrior;
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 use crate::stats::median;
@@ -73,7 +74,7 @@ pub(crate) fn adjust_local(scene: &mut Reconstruction, view_ix: usize, limits: &
     run(scene, &moves, limits.max_error_px);
 }
 
-/// Adjusts all views of a submap but the first, and keeps its scale.
+/// Adjusts all views of a submap but the first, and keeps its scale where no depth was measured.
 pub(crate) fn adjust_global(
     scene: &mut Reconstruction,
     submap: u32,
@@ -82,9 +83,11 @@ pub(crate) fn adjust_global(
 ) {
     let views = scene.submaps[submap as usize].views.clone();
     let Some(&first) = views.first() else { return };
+    make_metric(scene, submap);
     let before = spread(scene, first, &views);
     run(scene, &of_all(&views, max_steps), max_error_px);
-    if let Some(centre) = scene.centre(first) {
+    let is_free = !scene.submaps[submap as usize].is_metric;
+    if let Some(centre) = scene.centre(first).filter(|_| is_free) {
         let after = spread(scene, first, &views);
         if let Some(new_from_old) = kept_scale(centre, &before, &after) {
             scene.transform(submap, &new_from_old);
@@ -259,6 +262,7 @@ fn problem(
             seen.push(Observation {
                 camera_ix,
                 pixel: scene.distorted_pixel(at),
+                depth: scene.measured(at),
             });
         }
         problem.add_point(landmark.point, seen);

@@ -9,12 +9,14 @@ use crate::mvs::neighbours::depth_range;
 use crate::mvs::params::MvsParams;
 use crate::mvs::view::MvsView;
 use crate::sfm::depth_schedule::{DepthSchedule, Due};
+use crate::sfm::feature_depths::fill_measured;
 use crate::sfm::updates::{SparseBatch, SparseView};
 use splat_gpu::error::GpuError;
 use splat_image::undistort::Undistorter;
-use splat_types::camera::CameraModel;
+use splat_types::camera::{CameraModel, Intrinsics};
 use splat_types::depth::DepthMap;
 use splat_types::image::RgbImage;
+use splat_types::transform::Rigid;
 
 /// Images and raw depth are held of so many keyframes, about 1 MB each: matching reaches no further back.
 const MAX_HELD: usize = 32;
@@ -25,6 +27,8 @@ const MAX_DRIFT_PX: f64 = 1.0;
 #[derive(Debug)]
 pub(crate) struct Densifier {
     params: MvsParams,
+    /// Standard deviation of a depth sensor, in 1/m.
+    depth_noise: f64,
     state: DepthStream,
     /// Of all views so far: the lens by which the image was undistorted.
     lenses: BTreeMap<u32, Option<CameraModel>>,
@@ -43,9 +47,10 @@ pub(crate) enum NextDepth {
 }
 
 impl Densifier {
-    pub(crate) fn new(params: &MvsParams) -> Result<Self, GpuError> {
+    pub(crate) fn new(params: &MvsParams, depth_noise: f64) -> Result<Self, GpuError> {
         Ok(Self {
             params: params.clone(),
+            depth_noise,
             state: DepthStream::new(params.clone(), MAX_HELD)?,
             lenses: BTreeMap::new(),
             schedule: DepthSchedule::new(MAX_HELD),
@@ -136,10 +141,7 @@ impl Densifier {
     fn take_in(&mut self, sparse: &SparseBatch, image_of: &dyn Fn(u32) -> Option<Arc<RgbImage>>) {
         for revision in &sparse.revised {
             let id = revision.keyframe_id;
-            if self.state.holds(id) {
-                self.state
-                    .revise(id, revision.intrinsics, revision.submap_from_cam);
-            }
+            self.revise(id, revision.intrinsics, revision.submap_from_cam);
         }
         // All images first: the views of one batch are each other's best sources.
         for view in &sparse.views {
@@ -158,7 +160,7 @@ impl Densifier {
             // Let go long ago.
             Some(_) if !self.state.holds(id) => (),
             Some(lens) if *lens == view.lens => {
-                self.state.revise(id, view.intrinsics, submap_from_cam);
+                self.revise(id, view.intrinsics, submap_from_cam);
             }
             _ => {
                 let Some(image) = image_of(id).and_then(|image| undistorted(image, view)) else {
@@ -171,7 +173,16 @@ impl Densifier {
                 };
                 self.state.add(id, &rgb_image, 1.0, 2.0, &[]);
                 self.lenses.insert(id, view.lens);
+                if let Some(second) = &view.second {
+                    self.state.pair(id, second);
+                }
             }
+        }
+    }
+
+    fn revise(&mut self, id: u32, intrinsics: Intrinsics, submap_from_cam: Rigid) {
+        if self.state.holds(id) {
+            self.state.revise(id, intrinsics, submap_from_cam);
         }
     }
 
@@ -190,7 +201,8 @@ impl Densifier {
             .map(|n| n.keyframe_id)
             .filter(|n| self.state.holds(*n))
             .collect();
-        let n_sources = neighbours.len().min(self.params.source_views);
+        let n_own = usize::from(self.state.is_pair(id));
+        let n_sources = (n_own + neighbours.len()).min(self.params.source_views);
         let is_current = !is_forced
             && self.state.n_sources(id) >= n_sources
             && self
@@ -208,8 +220,23 @@ impl Densifier {
     }
 
     fn view(&self, view: &SparseView) -> View {
-        let depth = self.state.depth_of(view.keyframe_id);
-        registered(view, depth.unwrap_or_else(DepthMap::none))
+        let matched = self.state.depth_of(view.keyframe_id);
+        registered(view, self.with_measured(matched, view))
+    }
+
+    /// What was matched and confirmed by other views, and what was measured where nothing was: a depth camera is surer of itself, but
+    /// matched depth lies exactly where the images have it (kitchen7s_rgbd, live: 24.7 dB so, 23.8 the other way round).
+    fn with_measured(&self, matched: Option<DepthMap>, view: &SparseView) -> DepthMap {
+        let Some(measured) = &view.measured else {
+            return matched.unwrap_or_else(DepthMap::none);
+        };
+        let matched = matched.or_else(|| {
+            let (width, height) = self.state.size_of(view.keyframe_id)?;
+            Some(DepthMap::empty(width, height))
+        });
+        let mut map = matched.unwrap_or_else(DepthMap::none);
+        fill_measured(&mut map, measured, self.depth_noise);
+        map
     }
 }
 
@@ -221,6 +248,7 @@ fn reported(sparse: &SparseBatch, views: Vec<View>) -> GeometryBatch {
         revised: sparse.revised.clone(),
         is_loop: sparse.is_loop,
         observations: sparse.views.iter().map(observations).collect(),
+        metric: sparse.metric,
         note: sparse.note.clone(),
         ..GeometryBatch::default()
     }

@@ -6,8 +6,7 @@ use rayon::prelude::*;
 
 use crate::answer::{GeometryBatch, View};
 use crate::error::GeometryError;
-use crate::features::descriptor::{Features, working_image, working_size};
-use crate::features::extractor::FeatureExtractor;
+use crate::features::descriptor::working_size;
 use crate::matching::PreparedDescriptors;
 use crate::model::{DepthTask, GeometryModel, Work};
 use crate::mvs::depth_stream::SweptDepth;
@@ -16,10 +15,12 @@ use crate::sfm::adjust::adjust_global;
 use crate::sfm::calibrate::{MIN_UNCALIBRATED, current_share, start_uncalibrated};
 use crate::sfm::close_loops::{release_waiting, settle};
 use crate::sfm::dense_depth::{Densifier, NextDepth};
+use crate::sfm::finder::{Finder, Found};
 use crate::sfm::global_adjustment::{AdjustedSubmap, GlobalAdjustment};
 use crate::sfm::initialize::{Start, start};
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::merge;
+use crate::sfm::metric_submap::metric_unit;
 use crate::sfm::pairwise::{link_alike, link_anew, link_last, link_older, link_recent};
 use crate::sfm::params::SfmParams;
 use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView, Submap};
@@ -55,7 +56,7 @@ const FIRST_FOCAL: f64 = 0.9;
 #[derive(Debug)]
 pub struct Sfm {
     sfm: SfmParams,
-    finder: FeatureExtractor,
+    finder: Finder,
     pub(crate) densifier: Densifier,
     seed: u64,
     pub(crate) scene: Reconstruction,
@@ -85,6 +86,8 @@ struct Effort {
     max_features: usize,
     /// Keyframes just before it that it is matched with.
     n_last: usize,
+    /// Whether the second camera's image of all but the newest is looked at.
+    all_seconds: bool,
 }
 
 impl Sfm {
@@ -92,8 +95,8 @@ impl Sfm {
     pub fn new(sfm: &SfmParams, mvs: &MvsParams, seed: u64) -> Result<Self, GeometryError> {
         Ok(Self {
             sfm: sfm.clone(),
-            finder: FeatureExtractor::new(&sfm.features())?,
-            densifier: Densifier::new(mvs)?,
+            finder: Finder::new(sfm)?,
+            densifier: Densifier::new(mvs, sfm.depth_noise)?,
             seed,
             scene: Reconstruction::default(),
             reported: Reported::default(),
@@ -102,6 +105,12 @@ impl Sfm {
             is_loop: false,
             live: LiveState::default(),
         })
+    }
+
+    /// The same with the depth or the second images that keyframes bring, which give poses, landmarks and dense depth in metres.
+    pub fn with_sensors(mut self) -> Self {
+        self.finder.uses_sensors = true;
+        self
     }
 
     /// Takes a batch; keyframes seen before are only reported again.
@@ -125,17 +134,19 @@ impl Sfm {
             Effort {
                 max_features: (self.sfm.max_features as f64 * FEATURES_OF_MANY) as usize,
                 n_last: N_LAST_OF_MANY,
+                all_seconds: false,
             }
         } else {
             Effort {
                 max_features: self.sfm.max_features,
                 n_last: usize::MAX,
+                all_seconds: true,
             }
         };
         let link = |scene: &mut Reconstruction, newest, max_error_px, seed| {
             link_last(scene, newest, effort.n_last, max_error_px, seed);
         };
-        let limits = self.take_in_with(&batch.keyframes, effort.max_features, link);
+        let limits = self.take_in_with(&batch.keyframes, effort, link);
         self.live.behind.extend(first_new..self.scene.views.len());
         let fresh: Vec<usize> = (first_new..self.scene.views.len()).collect();
         grow_at_once(&mut self.scene, &fresh, &limits);
@@ -249,6 +260,7 @@ impl Sfm {
         let mut out = self.reported.changes(&self.scene, again);
         out.batch_id = self.batch_id;
         out.is_loop = std::mem::take(&mut self.is_loop);
+        out.metric = metric_unit(&self.scene);
         out.note = note(&self.scene, self.last_start);
         out
     }
@@ -259,14 +271,19 @@ impl Sfm {
             link_recent(scene, newest, max_error_px, seed);
             link_older(scene, newest, max_error_px, seed);
         };
-        self.take_in_with(keyframes, self.sfm.max_features, link)
+        let effort = Effort {
+            max_features: self.sfm.max_features,
+            n_last: usize::MAX,
+            all_seconds: true,
+        };
+        self.take_in_with(keyframes, effort, link)
     }
 
     /// Makes views of the keyframes that are new, and calls `link` with each, the limit of errors and a seed.
     fn take_in_with(
         &mut self,
         keyframes: &[Arc<Keyframe>],
-        max_features: usize,
+        effort: Effort,
         link: impl Fn(&mut Reconstruction, usize, f64, u64),
     ) -> Limits {
         let limits = self.limits(keyframes);
@@ -274,16 +291,15 @@ impl Sfm {
             .iter()
             .filter(|k| self.scene.view_of(k.id).is_none())
             .collect();
-        let looked = |keyframe: &&Arc<Keyframe>| {
-            let image = working_image(&keyframe.frame.image, self.sfm.max_side);
-            (
-                self.finder.features(&image, max_features),
-                (image.width as u32, image.height as u32),
-            )
+        let finder = &self.finder;
+        let newest = fresh.last().map(|keyframe| keyframe.id);
+        let look = |keyframe: &&Arc<Keyframe>| {
+            let with_second = effort.all_seconds || Some(keyframe.id) == newest;
+            finder.look_at(&keyframe.frame, effort.max_features, with_second)
         };
-        let found: Vec<(Features, (u32, u32))> = fresh.par_iter().map(looked).collect();
-        for (keyframe, (features, size)) in fresh.into_iter().zip(found) {
-            self.push(keyframe, features, size);
+        let found: Vec<Found> = fresh.par_iter().map(look).collect();
+        for (keyframe, found) in fresh.into_iter().zip(found) {
+            self.push(keyframe, found);
             let newest = self.scene.views.len() - 1;
             link(&mut self.scene, newest, limits.max_error_px, self.seed);
         }
@@ -329,8 +345,13 @@ impl Sfm {
         }
     }
 
-    /// Adds a view whose features are given in a working image of that size.
-    fn push(&mut self, keyframe: &Arc<Keyframe>, found: Features, (w, h): (u32, u32)) {
+    /// Adds a view.
+    fn push(&mut self, keyframe: &Arc<Keyframe>, found: Found) {
+        let Found {
+            features: found,
+            size: (w, h),
+            measured,
+        } = found;
         let image = &keyframe.frame.image;
         let known = keyframe.frame.intrinsics.filter(Intrinsics::is_plausible);
         let lens = known
@@ -347,6 +368,7 @@ impl Sfm {
             lens,
             is_calibrated: known.is_some(),
             registered: None,
+            measured,
             landmark_of: vec![NONE; found.len()],
             matched: vec![Vec::new(); found.len()],
             failed_with: 0,

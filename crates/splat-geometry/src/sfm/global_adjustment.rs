@@ -11,7 +11,8 @@ use glam::DVec3;
 use crate::sfm::adjust::{AdjustTask, adjust_local, kept_scale, share_lens};
 use crate::sfm::landmarks::filter;
 use crate::sfm::limits::Limits;
-use crate::sfm::reconstruction::Reconstruction;
+use crate::sfm::metric_submap::make_metric;
+use crate::sfm::reconstruction::{Reconstruction, Submap};
 use splat_types::transform::{Rigid, Similarity};
 
 /// The work, which needs nothing of the scene.
@@ -20,6 +21,8 @@ pub struct GlobalAdjustment {
     submap: u32,
     first: usize,
     n_rebuilt: u64,
+    /// Measured depth keeps the scale.
+    is_metric: bool,
     task: AdjustTask,
 }
 
@@ -45,14 +48,18 @@ impl GlobalAdjustment {
         max_error_px: f64,
         max_steps: usize,
     ) -> Option<Self> {
-        let views = &scene.submaps[submap as usize].views;
-        let (first, n) = (*views.first()?, views.len());
+        make_metric(scene, submap);
+        let Submap {
+            views, is_metric, ..
+        } = &scene.submaps[submap as usize];
+        let (first, n, is_metric) = (*views.first()?, views.len(), *is_metric);
         let task = AdjustTask::of_submap(scene, submap, max_error_px, max_steps);
         scene.submaps[submap as usize].n_adjusted = n;
         Some(Self {
             submap,
             first,
             n_rebuilt: scene.n_rebuilt,
+            is_metric,
             task,
         })
     }
@@ -90,7 +97,9 @@ impl GlobalAdjustment {
 
     /// What puts the scale back to what it was.
     fn scale_back(&self, start: &[Rigid]) -> Similarity {
-        let held = self.task.views.iter().position(|view| *view == self.first);
+        let views = &self.task.views;
+        let held = views.iter().position(|view| *view == self.first);
+        let held = held.filter(|_| !self.is_metric);
         let kept = held.and_then(|ix| {
             let centre = start[ix].inverse().translation;
             let away = |pose: &Rigid| pose.inverse().translation.distance(centre);

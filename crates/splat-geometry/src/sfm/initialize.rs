@@ -1,7 +1,8 @@
 //! Waiting views -> a new submap: the pair with most parallax, its landmarks, and all that can be registered on them.
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 
+use crate::pnp;
 use crate::sfm::adjust::{adjust_global, median_error_px};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
@@ -19,6 +20,8 @@ use splat_types::transform::{Rigid, Similarity};
 const MAX_ATTEMPTS: usize = 5;
 /// More parallax than this is no better: wide views share fewer matches.
 const ENOUGH_PARALLAX_DEG: f64 = 12.0;
+/// What a pair with measured depth counts for, which needs none.
+const MUCH_PARALLAX_DEG: f64 = 100.0;
 /// Share of matches on one plane from which on a pair is a poor start: two motions explain it about equally well.
 const PLANE_SHARE: f64 = 0.85;
 /// Share from which on both motions are tried: the one that five points gave may be the plane's wrong one.
@@ -118,6 +121,8 @@ struct FirstPair {
     second_from_first: Rigid,
     /// Homography, in pixels, of the plane that shows most of the matches, if it shows half of them.
     plane: Option<DMat3>,
+    /// The motion is in metres, by measured depth.
+    is_metric: bool,
 }
 
 impl FirstPair {
@@ -173,6 +178,10 @@ fn ranked_pairs(
         }
         has_matches = true;
         let seed = pair_seed(limits.seed, a, b);
+        if let Some(pair) = metric_pair(scene, (a, b), limits, seed) {
+            pairs.push(pair);
+            continue;
+        }
         let pixels = pixel_pairs(&scene.views[a], &scene.views[b], &link.matches);
         let lenses = [&scene.views[a].lens, &scene.views[b].lens];
         let found = link.motion.or_else(|| {
@@ -200,6 +209,7 @@ fn ranked_pairs(
             plane: on_plane
                 .filter(|_| share > HALF_PLANE_SHARE)
                 .map(|found| found.0),
+            is_metric: false,
         });
         if let Some(link) = scene.links.get_mut(&(a, b)) {
             link.motion = Some((pose, parallax));
@@ -207,6 +217,39 @@ fn ranked_pairs(
     }
     pairs.sort_by(|x, y| y.score.total_cmp(&x.score).then(x.ends.cmp(&y.ends)));
     (pairs, has_matches)
+}
+
+/// The motion between two views by what a depth sensor measured at the features of the first, which takes no parallax and leaves
+/// no second solution. `None` where too little was measured, and for a camera whose lens is unknown.
+fn metric_pair(
+    scene: &Reconstruction,
+    (a, b): (usize, usize),
+    limits: &Limits,
+    seed: u64,
+) -> Option<FirstPair> {
+    let (first, second) = (&scene.views[a], &scene.views[b]);
+    let depths = first.measured.as_ref()?;
+    if !first.is_calibrated || !second.is_calibrated {
+        return None;
+    }
+    let matches = scene.links[&(a, b)].matches.iter();
+    let measured = matches.filter_map(|&(ours, theirs)| {
+        let inverse = depths.of(ours as usize)?.inverse;
+        let ray = first.lens.ray_in_cam(first.features.pixels[ours as usize]);
+        Some((ray / inverse, second.features.pixels[theirs as usize]))
+    });
+    let (points, pixels): (Vec<DVec3>, Vec<DVec2>) = measured.unzip();
+    let gates = (1.5 * limits.max_error_px, limits.min_inliers);
+    let found = pnp::place(&points, &pixels, &second.lens, gates, seed)?;
+    let share = found.inliers.len() as f64 / points.len() as f64;
+    (share >= MIN_EXPLAINED).then_some(FirstPair {
+        // Any such pair goes before those that need parallax.
+        score: MUCH_PARALLAX_DEG * found.inliers.len() as f64,
+        ends: (a, b),
+        second_from_first: found.cam_from_world,
+        plane: None,
+        is_metric: true,
+    })
 }
 
 /// A submap that was started.
@@ -227,14 +270,18 @@ fn attempt(
     let (a, b) = pair.ends;
     let radial = scene.radial;
     let submap = scene.submaps.len() as u32;
-    scene.submaps.push(Submap::default());
+    scene.submaps.push(Submap {
+        is_metric: pair.is_metric,
+        ..Submap::default()
+    });
     scene.place(a, submap, Rigid::IDENTITY);
     scene.place(b, submap, pair.second_from_first);
     extend(scene, b, limits.max_error_px);
     adjust_global(scene, submap, limits.max_error_px, 15);
     extend(scene, b, limits.max_error_px);
     let n = scene.landmarks_of(&[a, b]).len();
-    if n >= limits.min_inliers && parallax_deg(scene, b) >= limits.min_parallax_deg {
+    let has_depth = pair.is_metric || parallax_deg(scene, b) >= limits.min_parallax_deg;
+    if n >= limits.min_inliers && has_depth {
         for &view in waiting {
             scene.views[view].failed_with = 0;
         }
@@ -255,7 +302,9 @@ fn attempt(
         // Any few images fit some focal length.
         let is_enough = n >= min_views && (!is_free || 2 * n > waiting.len());
         if is_enough && error_px <= 0.75 * limits.max_error_px && explained >= least {
-            normalise(scene, submap, a);
+            if !scene.submaps[submap as usize].is_metric {
+                normalise(scene, submap, a);
+            }
             return Some(Made {
                 n_views: n,
                 n_explained,

@@ -124,10 +124,10 @@ fn inlier_point(
         return None;
     }
     let mut best: Option<(DVec3, Vec<usize>)> = None;
-    for other in 1..observations.len() {
-        let Some(point) = triangulate(&[observations[0], observations[other]]) else {
-            continue;
-        };
+    let others = 1..observations.len();
+    let triangulated = others.filter_map(|i| triangulate(&[observations[0], observations[i]]));
+    let measured = seen.iter().filter_map(|at| scene.measured_point(*at));
+    for point in triangulated.chain(measured) {
         let fits: Vec<usize> = (0..observations.len())
             .filter(|&i| observations[i].error_px(point) <= max_error_px)
             .collect();
@@ -138,11 +138,40 @@ fn inlier_point(
     }
     let (_, fits) = best?;
     let picked: Vec<Observation<'_>> = fits.iter().map(|&i| observations[i]).collect();
-    let point = triangulate(&picked)?;
-    let centres: Vec<DVec3> = picked.iter().map(Observation::centre_in_world).collect();
-    let is_sharp = has_angle(centres.into_iter(), point, MIN_ANGLE_DEG.to_radians());
-    let fit_all = picked.iter().all(|s| s.error_px(point) <= max_error_px);
-    (is_sharp && fit_all).then(|| (point, fits.iter().map(|&i| seen[i]).collect()))
+    let seen: Vec<(u32, u32)> = fits.iter().map(|&i| seen[i]).collect();
+    let fit_all = |point: &DVec3| picked.iter().all(|s| s.error_px(*point) <= max_error_px);
+    let is_sharp = |point: &DVec3| {
+        let centres = picked.iter().map(Observation::centre_in_world);
+        has_angle(centres, *point, MIN_ANGLE_DEG.to_radians())
+    };
+    let point = triangulate(&picked).filter(|point| is_sharp(point) && fit_all(point));
+    // Where the rays are as good as parallel, what a sensor measured says how far it is.
+    let point = point.or_else(|| mean_measured(scene, &seen).filter(fit_all));
+    Some((point?, seen))
+}
+
+/// Mean of where the measured depths of the observations put their point; near ones are measured better.
+fn mean_measured(scene: &Reconstruction, seen: &[(u32, u32)]) -> Option<DVec3> {
+    let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
+    for &at in seen {
+        let measured = scene.measured(at).zip(scene.measured_point(at));
+        if let Some((depth, point)) = measured {
+            // The standard deviation of z grows with its square.
+            let weight = depth.inverse.powi(4);
+            sum += point * weight;
+            weights += weight;
+        }
+    }
+    (weights > 0.0).then(|| sum / weights)
+}
+
+/// Whether the measured depth of an observation says that its point is there.
+fn is_measured(scene: &Reconstruction, at: (u32, u32), point: DVec3, max_error_px: f64) -> bool {
+    let measured = scene.measured(at).zip(scene.observation(at));
+    measured.is_some_and(|(depth, observation)| {
+        let z = observation.cam_from_world.transform_point(point).z;
+        depth.residual_px(z).abs() <= 2.0 * max_error_px
+    })
 }
 
 /// Drops observations that do not fit their landmark, and landmarks without depth.
@@ -159,8 +188,11 @@ pub(crate) fn filter(scene: &mut Reconstruction, landmarks: &[u32], max_error_px
         };
         let kept: Vec<(u32, u32)> = seen.iter().copied().filter(fits).collect();
         let centres = kept.iter().filter_map(|at| scene.centre(at.0 as usize));
-        let is_sharp =
-            point.is_finite() && has_angle(centres, point, 0.7 * MIN_ANGLE_DEG.to_radians());
+        let is_sharp = point.is_finite()
+            && (has_angle(centres, point, 0.7 * MIN_ANGLE_DEG.to_radians())
+                || kept
+                    .iter()
+                    .any(|at| is_measured(scene, *at, point, max_error_px)));
         if !is_sharp || kept.len() < seen.len() {
             scene.retain_observations(landmark, |at| is_sharp && kept.contains(at));
         }

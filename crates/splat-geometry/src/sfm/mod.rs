@@ -6,7 +6,13 @@ mod limits;
 
 mod undistorted;
 
+mod feature_depths;
+
+mod finder;
+
 mod reconstruction;
+
+mod metric_submap;
 
 mod landmarks;
 

@@ -10,10 +10,13 @@ use rayon::prelude::*;
 
 use crate::features::descriptor::Features;
 use crate::matching::PreparedDescriptors;
+use crate::optim::bundle::problem::MeasuredDepth;
+use crate::sfm::feature_depths::FeatureDepths;
 use crate::sfm::undistorted::Undistorted;
 use crate::two_view::triangulate::Observation;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
-use splat_types::frame::Keyframe;
+use splat_types::depth::DepthMap;
+use splat_types::frame::{Frame, Keyframe, SecondImage};
 use splat_types::image::RgbImage;
 use splat_types::transform::{Rigid, Similarity};
 
@@ -31,6 +34,8 @@ pub(crate) struct SfmView {
     /// Where the features lie in the image of an uncalibrated camera, whose lens may bend; empty for others.
     pub(crate) distorted_pixels: Vec<DVec2>,
     pub(crate) registered: Option<RegisteredView>,
+    /// What a sensor measured at the features; `None` where none did, or what it says is not believed.
+    pub(crate) measured: Option<FeatureDepths>,
     /// Landmark of each feature, or `NONE`.
     pub(crate) landmark_of: Vec<u32>,
     /// For each feature its verified matches: (view, feature).
@@ -87,6 +92,8 @@ pub(crate) struct Submap {
     pub(crate) views: Vec<usize>,
     /// Views when all were last adjusted together.
     pub(crate) n_adjusted: usize,
+    /// Its unit is the metre, by measured depth.
+    pub(crate) is_metric: bool,
 }
 
 #[derive(Debug, Default)]
@@ -106,6 +113,8 @@ pub(crate) struct Reconstruction {
     pub(crate) undistorted: Undistorted,
     /// Views that have got matches or landmarks since submaps were last merged.
     pub(crate) unmerged: BTreeSet<usize>,
+    /// Views whose measured depth was not believed.
+    pub(crate) n_wrong_depths: u64,
     /// Grows when a submap is adjusted as a whole, merged or dissolved, or a loop is closed.
     pub(crate) n_rebuilt: u64,
 }
@@ -142,6 +151,46 @@ impl Reconstruction {
             intrinsics: &view.lens,
             pixel: self.pixel(at),
         })
+    }
+
+    /// The measured depth of an observation in a submap whose unit is the metre.
+    pub(crate) fn measured(&self, (view, feature): (u32, u32)) -> Option<MeasuredDepth> {
+        let view = &self.views[view as usize];
+        let submap = view.registered.as_ref()?.submap;
+        let is_metric = self.submaps[submap as usize].is_metric;
+        let depths = view.measured.as_ref().filter(|_| is_metric)?;
+        depths.of(feature as usize)
+    }
+
+    /// Where the measured depth of an observation puts its point.
+    pub(crate) fn measured_point(&self, at: (u32, u32)) -> Option<DVec3> {
+        let measured = self.measured(at)?;
+        let view = &self.views[at.0 as usize];
+        let in_cam = view.lens.ray_in_cam(self.pixel(at)) / measured.inverse;
+        let world_from_cam = view.registered.as_ref()?.cam_from_world.inverse();
+        Some(world_from_cam.transform_point(in_cam))
+    }
+
+    /// The depth map that a sensor measured in a view, where it is believed and the submap is in metres.
+    pub(crate) fn measured_map(&self, view_ix: usize) -> Option<Arc<DepthMap>> {
+        let frame = self.metric_frame(view_ix)?;
+        frame.sensor_depth.as_ref().map(Arc::clone)
+    }
+
+    /// The image of the second camera beside a view, likewise.
+    pub(crate) fn second_image(&self, view_ix: usize) -> Option<Arc<SecondImage>> {
+        let frame = self.metric_frame(view_ix)?;
+        let second = frame.second.as_ref();
+        second
+            .filter(|_| frame.sensor_depth.is_none())
+            .map(Arc::clone)
+    }
+
+    fn metric_frame(&self, view_ix: usize) -> Option<&Frame> {
+        let view = &self.views[view_ix];
+        let submap = view.registered.as_ref()?.submap;
+        let is_usable = self.submaps[submap as usize].is_metric && view.measured.is_some();
+        (is_usable && self.undistorted_of(view).is_none()).then_some(&view.keyframe.frame)
     }
 
     /// Lens and pinhole of a view's image; `None` where the image is a pinhole's as it is.

@@ -8,6 +8,7 @@ use crate::pnp;
 use crate::sfm::adjust::{adjust_global, adjust_local};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
+use crate::sfm::metric_submap::drop_wrong_depth;
 use crate::sfm::pairwise::{pair_seed, release};
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 
@@ -77,6 +78,7 @@ fn register_best(
             scene.views[view].failed_with = n_pairs;
             continue;
         };
+        drop_wrong_depth(scene, view, submap, &cam_from_world, &pairs);
         scene.place(view, submap, cam_from_world);
         extend(scene, view, limits.max_error_px);
         return Some(Registered {

@@ -1,15 +1,18 @@
 //! The scene -> what changed since it was last reported: new views, moved poses, why views are missing.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
-use crate::answer::{PoseQuality, PoseUpdate};
+use crate::answer::{MetricUnit, PoseQuality, PoseUpdate};
 use crate::optim::pose_covariance::pose_covariance;
 use crate::sfm::initialize::{Start, parallax_deg};
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 use crate::stats::median;
 use splat_types::camera::{CameraModel, Intrinsics};
+use splat_types::depth::DepthMap;
+use splat_types::frame::SecondImage;
 use splat_types::transform::Rigid;
 
 /// Exact words of the final error for a camera at rest; other modules and users look for them.
@@ -52,6 +55,10 @@ pub struct SparseView {
     pub submap_from_cam: Rigid,
     pub health: PoseQuality,
     pub landmarks: Vec<LandmarkObservation>,
+    /// What a sensor measured, in the unit of the submap, in the pixels of the keyframe's image.
+    pub measured: Option<Arc<DepthMap>>,
+    /// The second camera's image, where the unit of the submap is the metre.
+    pub second: Option<Arc<SecondImage>>,
     /// Most useful first: many shared landmarks, seen at an angle of some degrees.
     pub neighbours: Vec<Neighbour>,
 }
@@ -64,6 +71,7 @@ pub struct SparseBatch {
     pub revised: Vec<PoseUpdate>,
     /// As in `GeometryBatch`.
     pub is_loop: bool,
+    pub metric: Option<MetricUnit>,
     pub note: Option<String>,
 }
 
@@ -241,6 +249,8 @@ pub(crate) fn view(scene: &Reconstruction, view_ix: usize) -> Option<SparseView>
         submap_from_cam: registered.cam_from_world.inverse(),
         health,
         landmarks,
+        measured: scene.measured_map(view_ix),
+        second: scene.second_image(view_ix),
         neighbours: neighbours(scene, view_ix),
     })
 }

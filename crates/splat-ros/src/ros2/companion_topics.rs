@@ -9,13 +9,14 @@ use r2r::QosProfile;
 
 use crate::ros2::error::LinkError;
 use crate::ros2::node::Link;
-use splat_io::calibration::lens_of_camera_info;
+use splat_io::calibration::{is_rectified, lens_of_camera_info};
 use splat_io::ground_truth::{Track, Transforms};
 use splat_io::params::SourceParams;
+use splat_io::second_camera::{is_pair, second_from_first};
 use splat_io::survey::header_stamp;
-use splat_io::topics::is_rectified;
+use splat_io::topics::info_beside;
 use splat_msgs::ros::odometry::Odometry;
-use splat_msgs::ros::{self, CameraInfo, Image, Message, PoseStamped, TfMessage};
+use splat_msgs::ros::{self, CameraInfo, CompressedImage, Image, Message, PoseStamped, TfMessage};
 use splat_types::camera::CameraModel;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
@@ -39,6 +40,8 @@ struct CompanionState {
     odometry: Option<(String, Track)>,
     poses: Track,
     depths: VecDeque<(Stamp, Vec<u8>)>,
+    seconds: VecDeque<(Stamp, Vec<u8>)>,
+    second_info: Option<CameraInfo>,
     n_messages: u32,
     has_moving_transforms: bool,
 }
@@ -50,7 +53,19 @@ pub(crate) struct Beside {
     odom_frame: String,
     pub(crate) has_odometry_topic: bool,
     has_truth_topic: bool,
-    has_depth_topic: bool,
+    pub(crate) has_depth_topic: bool,
+    depth_within_nanos: u64,
+    pub(crate) is_depth_compressed: bool,
+    pub(crate) second: Option<SecondTopics>,
+}
+
+/// The topics of the second camera of a stereo pair.
+#[derive(Debug)]
+pub(crate) struct SecondTopics {
+    pub(crate) images: String,
+    pub(crate) is_compressed: bool,
+    info: String,
+    within_nanos: u64,
 }
 
 /// What goes with one image.
@@ -59,6 +74,7 @@ pub(crate) struct Companions {
     pub(crate) odometry: Option<Rigid>,
     pub(crate) truth: Option<Rigid>,
     pub(crate) depth: Option<Vec<u8>>,
+    pub(crate) second: Option<Vec<u8>>,
 }
 
 impl Beside {
@@ -73,6 +89,9 @@ impl Beside {
             has_odometry_topic: !params.odometry_topic.is_empty(),
             has_truth_topic: !params.pose_topic.is_empty(),
             has_depth_topic: !params.depth_topic.is_empty(),
+            depth_within_nanos: (1e9 * params.depth_tolerance) as u64,
+            is_depth_compressed: is_compressed(&params.depth_topic),
+            second: SecondTopics::of(params),
         };
         let sensor = QosProfile::sensor_data;
         // Reliable publishers suit a best-effort listener, too; latched ones are asked for what they said before.
@@ -121,25 +140,68 @@ impl Beside {
             )?;
         }
         if beside.has_depth_topic {
-            let received = Arc::clone(&beside.received);
-            link.subscribe(
-                &params.depth_topic,
-                Image::TYPE_NAME,
-                sensor(),
-                move |payload| {
-                    if let Some(stamp) = header_stamp(&payload, 0) {
-                        let depths = &mut lock(&received).depths;
-                        depths.push_back((stamp, payload));
-                        let n_bytes: usize = depths.iter().map(|(_, payload)| payload.len()).sum();
-                        if depths.len() > MAX_DEPTHS || n_bytes > MAX_DEPTH_BYTES {
-                            depths.pop_front();
-                        }
-                    }
-                    true
-                },
-            )?;
+            let topic = (&*params.depth_topic, beside.is_depth_compressed);
+            beside.hold_images(link, topic, |received| &mut received.depths)?;
+        }
+        if let Some(second) = &beside.second {
+            let topic = (&*second.images, second.is_compressed);
+            beside.hold_images(link, topic, |received| &mut received.seconds)?;
+            beside.receive::<CameraInfo>(link, &second.info, sensor(), |received, info| {
+                received.second_info = Some(info);
+            })?;
         }
         Ok(beside)
+    }
+
+    /// Holds the newest images of a topic as they come; whether they are compressed stands beside its name.
+    fn hold_images(
+        &self,
+        link: &Link,
+        (topic, is_compressed): (&str, bool),
+        held: impl Fn(&mut CompanionState) -> &mut VecDeque<(Stamp, Vec<u8>)> + Send + 'static,
+    ) -> Result<(), LinkError> {
+        let type_name = if is_compressed {
+            CompressedImage::TYPE_NAME
+        } else {
+            Image::TYPE_NAME
+        };
+        let received = Arc::clone(&self.received);
+        link.subscribe(
+            topic,
+            type_name,
+            QosProfile::sensor_data(),
+            move |payload| {
+                if let Some(stamp) = header_stamp(&payload, 0) {
+                    let mut received = lock(&received);
+                    let images = held(&mut received);
+                    images.push_back((stamp, payload));
+                    let n_bytes: usize = images.iter().map(|(_, payload)| payload.len()).sum();
+                    if images.len() > MAX_DEPTHS || n_bytes > MAX_DEPTH_BYTES {
+                        images.pop_front();
+                    }
+                }
+                true
+            },
+        )
+    }
+
+    /// Lens of the second camera and how it is mounted, once its calibration has come; `None` where the topics say neither.
+    pub(crate) fn second_camera(
+        &self,
+        image_topic: &str,
+        camera_frame: &str,
+    ) -> Option<(CameraModel, Rigid)> {
+        let topics = self.second.as_ref()?;
+        let received = lock(&self.received);
+        let (first, second) = (received.info.as_ref()?, received.second_info.as_ref()?);
+        let lens = lens_of_camera_info(second, is_rectified(&topics.images, second)).ok()?;
+        let by_calibration = second_from_first((image_topic, first), (&topics.images, second));
+        let by_transforms = || {
+            let frame = &second.header.frame_id;
+            let mounted = received.transforms.fixed(frame, camera_frame)?;
+            is_pair(&mounted).then_some(mounted)
+        };
+        Some((lens, by_calibration.or_else(by_transforms)?))
     }
 
     /// Messages that do not decode are left out: what they lack shows where it is missed.
@@ -211,15 +273,18 @@ impl Beside {
             None
         };
         let truth = received.poses.nearest(stamp, TRUTH_WITHIN_NANOS);
-        let depth = received.depths.iter().find(|(at, _)| *at == stamp);
-        let depth = depth.map(|(_, payload)| payload.clone());
+        let depth = nearest(&received.depths, stamp, self.depth_within_nanos);
+        let second = self.second.as_ref();
+        let second = second.and_then(|s| nearest(&received.seconds, stamp, s.within_nanos));
         let is_whole = (odometry.is_some() || !(self.has_odometry_topic || uses_transforms))
             && (truth.is_some() || !self.has_truth_topic)
-            && (depth.is_some() || !self.has_depth_topic);
+            && (depth.is_some() || !self.has_depth_topic)
+            && (second.is_some() || self.second.is_none());
         let companions = Companions {
             odometry,
             truth,
             depth,
+            second,
         };
         (companions, is_whole)
     }
@@ -233,6 +298,7 @@ impl Beside {
         received.odometry = None;
         received.poses = Track::default();
         received.depths.clear();
+        received.seconds.clear();
     }
 }
 
@@ -250,6 +316,40 @@ impl CompanionState {
         }
         self.poses.forget_before(oldest);
     }
+}
+
+impl SecondTopics {
+    /// As the parameters name them.
+    fn of(params: &SourceParams) -> Option<Self> {
+        let images = params.second_image_topic.clone();
+        if images.is_empty() {
+            return None;
+        }
+        let info = if params.second_camera_info_topic.is_empty() {
+            info_beside(&images)
+        } else {
+            params.second_camera_info_topic.clone()
+        };
+        Some(Self {
+            is_compressed: is_compressed(&images),
+            within_nanos: (1e9 * params.stereo_tolerance) as u64,
+            images,
+            info,
+        })
+    }
+}
+
+/// The image whose stamp is nearest, if it is near enough.
+fn nearest(held: &VecDeque<(Stamp, Vec<u8>)>, stamp: Stamp, within_nanos: u64) -> Option<Vec<u8>> {
+    let off = |(at, _): &&(Stamp, Vec<u8>)| at.nanos.abs_diff(stamp.nanos);
+    let nearest = held.iter().min_by_key(off);
+    let near = nearest.filter(|image| off(image) <= within_nanos);
+    near.map(|(_, payload)| payload.clone())
+}
+
+/// Whether the images of a topic are compressed, by the name that image_transport gives it.
+fn is_compressed(topic: &str) -> bool {
+    topic.ends_with("/compressedDepth") || topic.ends_with("/compressed")
 }
 
 fn lock(received: &Mutex<CompanionState>) -> MutexGuard<'_, CompanionState> {

@@ -11,11 +11,12 @@ use crate::ros2::node::Link;
 use crate::ros2::params::OnTimeJump;
 use crate::ros2::topic_watch::{Watch, why_silent};
 use splat_io::error::SourceError;
-use splat_io::frame_source::{Polled, Source, SourceCounts};
+use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts};
 use splat_io::intake::{Extras, Intake};
 use splat_io::mcap::{depth_of, image_of};
 use splat_io::params::SourceParams;
 use splat_io::queue::Received;
+use splat_io::second_camera::SecondCamera;
 use splat_io::survey::header_frame;
 use splat_io::topics::info_beside;
 use splat_types::frame::Frame;
@@ -40,6 +41,7 @@ pub struct Ros2Source {
     beside: Beside,
     /// Made with the first frame, when the lens is known or given up.
     intake: Option<Intake>,
+    second: Option<SecondCamera>,
     /// Before there is an intake.
     n_unreadable: u64,
     camera_frame: String,
@@ -84,6 +86,7 @@ impl Ros2Source {
             topic: topic.to_owned(),
             subscription: None,
             intake: None,
+            second: None,
             n_unreadable: 0,
             camera_frame: String::new(),
             uses_transforms: false,
@@ -139,7 +142,9 @@ impl Ros2Source {
         };
         if self.intake.is_none() {
             self.camera_frame = header_frame(&image.payload).unwrap_or_default();
-            let has_lens = self.beside.lens(&self.topic).is_some();
+            let second = self.beside.second_camera(&self.topic, &self.camera_frame);
+            let has_second = self.beside.second.is_none() || second.is_some();
+            let has_lens = self.beside.lens(&self.topic).is_some() && has_second;
             let is_settled = waited > SETTLE_SECS && !self.beside.has_moving_transforms();
             let has_odometry = self.beside.reaches_odometry(&self.camera_frame)
                 || self.beside.has_odometry_topic
@@ -186,6 +191,15 @@ impl Ros2Source {
             "first image, in frame {:?}",
             self.camera_frame
         );
+        let second = self.beside.second_camera(&self.topic, &self.camera_frame);
+        if let Some(topics) = self.beside.second.as_ref().filter(|_| second.is_none()) {
+            tracing::warn!(
+                "no stereo: neither CameraInfo beside {:?} nor /tf_static says how the cameras are mounted",
+                topics.images
+            );
+        }
+        let second = second.filter(|_| lens.is_some());
+        self.second = second.map(|(lens, mounted)| SecondCamera::new(&self.params, lens, mounted));
         self.intake = Some(Intake::new(&self.params, lens));
     }
 
@@ -201,18 +215,27 @@ impl Ros2Source {
         };
         let arrival = intake.arrive(stamp)?;
         let sensor_depth = companions.depth.and_then(|payload| {
-            let depth = depth_of(&payload);
+            let depth = depth_of(&payload, self.beside.is_depth_compressed);
             let complain = |reason: &String| {
-                intake.warn_once("depth", &format!("depth maps are left out: {reason}"));
+                intake.warn_once("depth", &format!("depth images are left out: {reason}"));
             };
             depth.inspect_err(complain).ok()
         });
+        if self.beside.has_depth_topic && sensor_depth.is_none() {
+            intake.without_depth();
+        }
+        let second = self.second.as_ref().zip(companions.second);
+        let second = second.map(|(camera, payload)| camera.image(stamp, payload));
+        if self.second.is_some() && second.is_none() {
+            intake.without_second();
+        }
         match image_of(&image.payload, is_compressed) {
             Ok(pixels) => {
                 let extras = Extras {
                     truth: companions.truth,
                     odometry: companions.odometry,
                     sensor_depth,
+                    second,
                     ..Extras::default()
                 };
                 let frame = intake.frame(arrival, pixels, extras);
@@ -356,6 +379,16 @@ impl Source for Ros2Source {
 
     fn camera_frame(&self) -> &str {
         &self.camera_frame
+    }
+
+    fn metric_input(&self) -> MetricInput {
+        if self.beside.has_depth_topic {
+            MetricInput::Depth
+        } else if self.beside.second.is_some() {
+            MetricInput::Stereo
+        } else {
+            MetricInput::None
+        }
     }
 
     fn warnings(&self) -> Vec<String> {

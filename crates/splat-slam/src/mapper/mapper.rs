@@ -165,6 +165,10 @@ impl Mapper {
             self.submaps.forget(&given_up);
         }
         self.splats.set_progress(progress);
+        if let Some(unit) = geometry.metric {
+            self.scale.set_unit(unit);
+            self.submaps.anchor().keep_scale();
+        }
         self.find_prior(batch, geometry)?;
         self.hold_anchor()?;
         let (keyframes, engine) = (&mut self.keyframes, &mut *self.engine);

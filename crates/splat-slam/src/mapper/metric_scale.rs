@@ -10,6 +10,8 @@ use crate::mapper::keyframes::metric_ratios;
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
 use crate::mapper::metric_scale_params::{MetricSource, ScaleParams};
+use splat_geometry::answer::MetricUnit;
+use splat_geometry::similarity;
 use splat_types::snapshot::{KeyframePose, Scale, ScaleSource};
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
@@ -102,6 +104,8 @@ pub(crate) struct MetricScale {
     /// The model's lengths are metres.
     is_given: bool,
     has_depth_of_poses: bool,
+    /// What makes the model's lengths metres, if anything does.
+    unit: Option<MetricUnit>,
 }
 
 impl MetricScale {
@@ -111,11 +115,17 @@ impl MetricScale {
             params: None,
             is_given: scale == Scale::GIVEN,
             has_depth_of_poses: false,
+            unit: None,
         }
     }
 
     pub(crate) fn set_one_for_all_views(&mut self, has: bool) {
         self.has_depth_of_poses = has;
+    }
+
+    /// From now on the model's lengths are metres.
+    pub(crate) fn set_unit(&mut self, unit: MetricUnit) {
+        self.unit = Some(unit);
     }
 
     /// Depth of single views needs no factor.
@@ -163,6 +173,10 @@ impl MetricScale {
         if self.scale.source == ScaleSource::Given || params.source == MetricSource::Off {
             return self.scale;
         }
+        let by_model = params.source == MetricSource::Auto || params.source == MetricSource::Depth;
+        if let Some(unit) = self.unit.filter(|_| by_model) {
+            return self.noted(of_model(unit, keyframes, poses));
+        }
         for registered in keyframes.values_mut() {
             metric_ratios::measure(registered, &params);
         }
@@ -186,6 +200,11 @@ impl MetricScale {
                 std: Some(metres * estimate.std),
             }
         });
+        self.noted(scale)
+    }
+
+    /// Says so where it comes of something else than before.
+    fn noted(&self, scale: Scale) -> Scale {
         if scale.source != self.scale.source {
             tracing::info!(
                 source = scale.source.name(),
@@ -195,6 +214,22 @@ impl MetricScale {
             );
         }
         scale
+    }
+}
+
+/// Where the model's lengths are metres: how long one unit of the map is in them.
+fn of_model(unit: MetricUnit, keyframes: &KeyframeStore, poses: &[KeyframePose]) -> Scale {
+    let pair = |p: &RegisteredKeyframe| {
+        let world_from_cam = pose_at(poses, p.keyframe.frame.stamp)?;
+        Some((world_from_cam, p.submap_from_cam))
+    };
+    let pairs: Vec<(Rigid, Rigid)> = keyframes.registered().values().filter_map(pair).collect();
+    let units_per_metre = similarity::of_poses(&pairs).map_or(1.0, |s| s.scale);
+    let metres = 1.0 / units_per_metre;
+    Scale {
+        source: unit.source,
+        metres_per_unit: Some(metres),
+        std: Some(metres * unit.relative_std),
     }
 }
 

@@ -252,6 +252,7 @@ impl LocalMap {
                     Some(problem::Observation {
                         camera_ix: ix as u32,
                         pixel: *keyframe.pixels.get(id)?,
+                        depth: None,
                     })
                 })
                 .collect();

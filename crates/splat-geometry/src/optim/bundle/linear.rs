@@ -7,13 +7,13 @@ use std::ops::Range;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::optim::bundle::problem::{Camera, Flat, State, project, strayed, times};
+use crate::optim::bundle::problem::{Camera, Flat, MeasuredDepth, State, project, strayed, times};
 use crate::optim::bundle::reduced::{HELD, LENS, Layout, Solution, System};
 
 /// Chunks of points that are summed apart.
 const CHUNKS: usize = 8;
 
-/// One observation, linearised and weighted: u and v by pose, lens and point.
+/// One observation, linearised and weighted: u and v by pose, lens and point. A measured depth has a row of its own.
 #[derive(Debug)]
 struct Row {
     slot: u32,
@@ -91,20 +91,23 @@ fn chunk(
             let camera_ix = seen.camera_ix as usize;
             let camera = &state.cameras[camera_ix];
             let turn = &rotations[camera_ix];
-            let Some(mut row) = row(camera, turn, state.points[point_ix], seen.pixel, flat) else {
-                continue;
-            };
-            let [a, b] = row.by_point.map(DVec3::from_array);
-            g += a * row.residual[0] + b * row.residual[1];
-            for (k, (i, j)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-                .into_iter()
-                .enumerate()
-            {
-                v[k] += a[i] * a[j] + b[i] * b[j];
-            }
-            row.slot = layout.slot_of[camera_ix];
-            if row.slot != HELD || (camera.shares_lens && flat.moves_lens()) {
-                out.rows.push(row);
+            let point = state.points[point_ix];
+            let in_image = row(camera, turn, point, seen.pixel, flat);
+            let in_depth = seen.depth.filter(|_| in_image.is_some());
+            let in_depth = in_depth.map(|depth| depth_row(camera, turn, point, depth, flat));
+            for mut row in in_image.into_iter().chain(in_depth) {
+                let [a, b] = row.by_point.map(DVec3::from_array);
+                g += a * row.residual[0] + b * row.residual[1];
+                for (k, (i, j)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+                    .into_iter()
+                    .enumerate()
+                {
+                    v[k] += a[i] * a[j] + b[i] * b[j];
+                }
+                row.slot = layout.slot_of[camera_ix];
+                if row.slot != HELD || (camera.shares_lens && flat.moves_lens()) {
+                    out.rows.push(row);
+                }
             }
         }
         out.blocks.push(PointBlock {
@@ -170,6 +173,32 @@ fn row(
         by_lens,
         by_point,
     })
+}
+
+/// The row of a measured depth, beside that of the pixel; the second residual is none. The lens has no part in it.
+fn depth_row(
+    camera: &Camera,
+    rotation: &DMat3,
+    point: DVec3,
+    depth: MeasuredDepth,
+    flat: &Flat<'_>,
+) -> Row {
+    let p = *rotation * point + camera.cam_from_world.translation;
+    let r = depth.residual_px(p.z);
+    let w = (1.0 / (1.0 + r * r / (flat.loss_px * flat.loss_px))).sqrt();
+    // A shift of the camera along its axis moves z by as much; a turn (a, b, c) moves it by (a, b, c) x p.
+    let by_z = -w * depth.px_per_inverse / (p.z * p.z);
+    let none = [0.0; 6];
+    Row {
+        slot: HELD,
+        residual: [w * r, 0.0],
+        by_pose: [[0.0, 0.0, by_z, by_z * p.y, -by_z * p.x, 0.0], none],
+        by_lens: [[0.0; LENS]; 2],
+        by_point: [
+            (rotation.transpose() * DVec3::new(0.0, 0.0, by_z)).to_array(),
+            [0.0; 3],
+        ],
+    }
 }
 
 /// The system that is left of the cameras when each point follows them.

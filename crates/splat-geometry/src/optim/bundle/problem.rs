@@ -26,6 +26,28 @@ pub struct Camera {
 pub struct Observation {
     pub camera_ix: u32,
     pub pixel: DVec2,
+    /// What a sensor measured of the point's distance.
+    pub depth: Option<MeasuredDepth>,
+}
+
+/// The distance of a point along the camera's axis, by a depth camera or a stereo pair.
+///
+/// The residual is `px_per_inverse (1/z - inverse)`: in inverse depth the noise of triangulating sensors is the same at every
+/// distance, and the factor brings it to the pixels' noise, so that one loss serves both (the third coordinate of a stereo
+/// observation in Mur-Artal and Tardos 2017, section III-B).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredDepth {
+    /// 1 / (units of the world).
+    pub inverse: f64,
+    /// Pixels that an error of 1 in `inverse` counts as.
+    pub px_per_inverse: f64,
+}
+
+impl MeasuredDepth {
+    /// The residual in pixels of a point at `z` before the camera.
+    pub fn residual_px(&self, z: f64) -> f64 {
+        self.px_per_inverse * (1.0 / z - self.inverse)
+    }
 }
 
 /// Points are added with `add_point`, which keeps their observations side by side.

@@ -59,6 +59,7 @@ pub(crate) fn problem(noise_px: f64, wrong: f64) -> Problem {
             seen.push(Observation {
                 camera_ix: camera_ix as u32,
                 pixel: exact + off,
+                depth: None,
             });
         }
         out.add_point(point, seen);
@@ -274,6 +275,7 @@ fn a_long_loop_moves_as_a_whole() {
             is_inside.then_some(Observation {
                 camera_ix: i as u32,
                 pixel,
+                depth: None,
             })
         };
         let seen: Vec<Observation> = truth

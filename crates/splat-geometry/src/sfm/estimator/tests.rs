@@ -6,6 +6,7 @@ use rand_pcg::Pcg32;
 
 use crate::features::descriptor::{Descriptors, Features};
 use crate::sfm::estimator::*;
+use crate::sfm::feature_depths::FeatureDepths;
 use crate::sfm::merge_submaps;
 use crate::sfm::reconstruction::distorted;
 use crate::sfm::updates::NO_PARALLAX;
@@ -34,6 +35,8 @@ struct World {
     rng: Pcg32,
     /// Of the lens that sees it.
     radial: f64,
+    /// Distances along the axis of what was seen last.
+    depths: Vec<f64>,
 }
 
 impl World {
@@ -46,6 +49,7 @@ impl World {
             descriptors,
             rng,
             radial: 0.0,
+            depths: Vec::new(),
         }
     }
 
@@ -54,6 +58,7 @@ impl World {
         let cam_from_world = world_from_cam.inverse();
         let mut out = Features::default();
         let mut descriptors = Vec::new();
+        self.depths.clear();
         for i in 0..self.points.len() {
             let lens = distorted(&camera(), self.radial);
             let Some(pixel) = lens.project(cam_from_world.transform_point(self.points[i])) else {
@@ -72,6 +77,8 @@ impl World {
                 };
                 out.pixels.push(pixel + noise);
                 out.sigmas.push(2.0);
+                let point_in_cam = cam_from_world.transform_point(self.points[i]);
+                self.depths.push(point_in_cam.z);
                 descriptors.push(self.descriptors[named]);
             }
         }
@@ -100,6 +107,16 @@ fn arc(n: usize, from_deg: f64, to_deg: f64) -> Vec<Rigid> {
 }
 
 fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (Sfm, SparseBatch) {
+    run_measuring(world, poses, intrinsics, |_, _| None)
+}
+
+/// `measure` gives what a sensor measures of features at some distances, in a keyframe.
+fn run_measuring(
+    world: &mut World,
+    poses: &[Rigid],
+    intrinsics: Option<Intrinsics>,
+    mut measure: impl FnMut(usize, &[f64]) -> Option<FeatureDepths>,
+) -> (Sfm, SparseBatch) {
     let mut sfm = Sfm::new(&SfmParams::default(), &MvsParams::default(), 1).unwrap();
     let image = Arc::new(RgbImage {
         width_px: SIZE.0,
@@ -116,7 +133,14 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out: false,
+        };
+        let features = world.seen_from(pose);
+        let found = Found {
+            features,
+            size: SIZE,
+            measured: measure(id, &world.depths),
         };
         sfm.push(
             &Arc::new(Keyframe {
@@ -124,8 +148,7 @@ fn run(world: &mut World, poses: &[Rigid], intrinsics: Option<Intrinsics>) -> (S
                 frame,
                 age: Stopwatch::start(),
             }),
-            world.seen_from(pose),
-            SIZE,
+            found,
         );
         let limits = sfm.limits(&[]);
         link_recent(&mut sfm.scene, id, limits.max_error_px, 1);
@@ -443,6 +466,7 @@ fn blank_tiny_and_broken_images_are_survived() {
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out: false,
         };
         Arc::new(Keyframe {
@@ -467,3 +491,5 @@ fn blank_tiny_and_broken_images_are_survived() {
     assert!(out.views.is_empty() && out.note.is_some_and(|n| n.contains(NO_PARALLAX)));
     assert!(sfm.finish().unwrap().views.is_empty());
 }
+
+mod measured;

@@ -137,6 +137,7 @@ impl Mapper {
             truth: None,
             odometry: None,
             sensor_depth: None,
+            second: None,
             is_held_out,
         };
         let keyframe = Keyframe {

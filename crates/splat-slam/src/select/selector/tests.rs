@@ -34,6 +34,7 @@ fn frame(seq: u64, shift_px: f64, contrast: f64) -> Frame {
         truth: None,
         odometry: None,
         sensor_depth: None,
+        second: None,
         is_held_out: false,
     }
 }

@@ -18,6 +18,12 @@ fn gradients_are_those_of_differences() {
     let mut hold = [[0.0; 6]; 6];
     (0..6).for_each(|k| hold[k][k] = 1e4 * (k + 1) as f64);
     problem.cameras[3].hold = Some(hold);
+    for observation in problem.observations.iter_mut().step_by(3) {
+        observation.depth = Some(MeasuredDepth {
+            inverse: 0.21,
+            px_per_inverse: 150.0,
+        });
+    }
     let settings = Settings {
         max_steps: 0,
         loss_px: 3.0,
