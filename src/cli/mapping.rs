@@ -101,7 +101,7 @@ pub(crate) fn localise(args: &LocaliseArgs) -> anyhow::Result<ExitCode> {
     }
     run_dir::start_log(args.out.as_deref(), std::io::stderr().is_terminal())?;
     settings.log_warnings();
-    let mut source = open_source::open(&args.input, &params.source, params.seed)?;
+    let mut source = open_source::open_for(&args.input, &params)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
     source.end_when(stop.flag());
@@ -168,7 +168,7 @@ fn map(settings: &Settings, input: &str, out: Option<&Path>) -> anyhow::Result<E
     let params = settings.params().map_err(|e| usage(&e))?;
     // A network that cannot be used is better known before the work than after it.
     let lpips = lpips::lpips(&params.eval.lpips_model)?;
-    let source = open_source::open(input, &params.source, params.seed)?;
+    let source = open_source::open_for(input, &params)?;
     let stop = Stop::default();
     stop_on_ctrl_c(&stop)?;
     let transport = ros2.as_ref().map(ros2::Node::transport).transpose()?;

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use crate::params::params::Params;
 use splat_io::camera::live::{Live, Opener};
 use splat_io::camera::source::CameraSource;
 use splat_io::camera_info;
@@ -13,6 +14,8 @@ use splat_io::images::{self, ImagesSource};
 use splat_io::mcap::McapSource;
 use splat_io::params::SourceParams;
 use splat_io::recording::Input;
+#[cfg(feature = "zenoh")]
+use splat_ros::zenoh::source::ZenohSource;
 use splat_synth::endless::EndlessSource;
 use splat_synth::source::SyntheticSource;
 
@@ -70,6 +73,16 @@ fn webcam_opener(index: &str, _params: &SourceParams) -> Result<Opener, SourceEr
     })
 }
 
+/// Opens `zenoh:TOPIC`, which connects as `publish.zenoh_*` says, or whatever else `open` does.
+pub fn open_for(uri: &str, params: &Params) -> Result<Box<dyn Source>, SourceError> {
+    #[cfg(feature = "zenoh")]
+    if let Some(topic) = uri.strip_prefix("zenoh:") {
+        let source = ZenohSource::open(topic, &params.source, &params.publish)?;
+        return Ok(Box::new(source));
+    }
+    open(uri, &params.source, params.seed)
+}
+
 /// Opens a camera, `mcap:PATH`, `images:DIR`, `synthetic:SCENE`, or the bare path of a recording or a folder.
 pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Source>, SourceError> {
     if let Some(opener) = camera_opener(uri, params) {
@@ -95,7 +108,7 @@ pub fn open(uri: &str, params: &SourceParams, seed: u64) -> Result<Box<dyn Sourc
             "build where ROS 2 is sourced, with --features ros2 (docs/ROS2.md), or record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
         ),
         Some(("zenoh", _)) => not_in_build(
-            "record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
+            "run and localise take it, in builds with --features zenoh; else record the topic with ros2 bag record -s mcap TOPIC and open that recording as mcap:PATH",
         ),
         _ => open_path(uri, params, seed),
     }

@@ -100,3 +100,4 @@ mod viewer_strangers;
 mod visual_odometry;
 mod written_scenes;
 mod xfeat;
+mod zenoh_source;

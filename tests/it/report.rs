@@ -37,6 +37,8 @@ frames.dropped
 frames.out_of_order
 frames.received
 frames.undecodable
+frames.without_depth
+frames.without_second
 geometry_note
 keyframes.before
 keyframes.components

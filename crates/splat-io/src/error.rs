@@ -29,7 +29,7 @@ pub enum SourceError {
     NotInBuild { uri: String, way_out: &'static str },
     #[error(transparent)]
     Camera(#[from] CameraError),
-    #[cfg(feature = "ros2")]
+    #[cfg(feature = "live-messages")]
     #[error("cannot subscribe to {topic:?}: {reason}")]
     Subscribe { topic: String, reason: String },
 }

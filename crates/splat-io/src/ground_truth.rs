@@ -74,7 +74,7 @@ impl Track {
         self.by_nanos.is_empty()
     }
 
-    #[cfg(feature = "ros2")]
+    #[cfg(feature = "live-messages")]
     pub fn forget_before(&mut self, stamp: Stamp) {
         self.by_nanos = self.by_nanos.split_off(&stamp.nanos);
     }
@@ -233,7 +233,7 @@ impl Transforms {
     }
 
     /// Live input goes on for ever: what moves is kept from `stamp` on, what is fixed as it was reported last.
-    #[cfg(feature = "ros2")]
+    #[cfg(feature = "live-messages")]
     pub fn forget_before(&mut self, stamp: Stamp) {
         for link in self.links.values_mut() {
             let from = match link.track.by_nanos.last_key_value() {
@@ -248,7 +248,7 @@ impl Transforms {
     }
 
     /// Whether a frame is above another.
-    #[cfg(feature = "ros2")]
+    #[cfg(feature = "live-messages")]
     pub fn reaches(&self, child: &str, parent: &str) -> bool {
         self.chain(child, parent).is_some()
     }

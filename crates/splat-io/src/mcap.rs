@@ -338,7 +338,7 @@ fn bytes_of(queue: &VecDeque<Waiting>) -> usize {
 }
 
 /// For sources whose images come as messages, too.
-#[cfg(feature = "ros2")]
+#[cfg(feature = "live-messages")]
 pub fn image_of(payload: &[u8], is_compressed: bool) -> Result<RgbImage, String> {
     let mut out = splat_image::limits::empty();
     decode_into(payload, is_compressed, &mut Jpeg::default(), &mut out)?;

@@ -229,7 +229,7 @@ pub fn header_stamp(payload: &[u8], log_nanos: i64) -> Option<Stamp> {
 }
 
 /// Frame of a message that begins with a header, without decoding the rest.
-#[cfg(feature = "ros2")]
+#[cfg(feature = "live-messages")]
 pub fn header_frame(payload: &[u8]) -> Option<String> {
     let (&[_, endian, _, _], rest) = payload.split_first_chunk::<4>()?;
     let (&length, rest) = rest.get(8..)?.split_first_chunk::<4>()?;

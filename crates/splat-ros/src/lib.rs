@@ -37,6 +37,9 @@ pub mod render_view;
 
 pub mod service_server;
 
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+mod live_images;
+
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 

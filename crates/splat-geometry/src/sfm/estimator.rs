@@ -37,8 +37,6 @@ const ERROR_SIDE_PX: f64 = 640.0;
 const MIN_NEW_SUBMAP: usize = 4;
 /// Waiting keyframes that are tried with every batch, the newest; all others once more at the end.
 const MAX_WAITING: usize = 64;
-/// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
-const MAX_IMAGES: usize = 128;
 /// Live: views that may wait for what they have seen long ago to be looked for, as many as links that agree on a loop may lie
 /// apart. Of more, the oldest do without.
 const MAX_BEHIND: usize = 24;
@@ -303,20 +301,8 @@ impl Sfm {
             let newest = self.scene.views.len() - 1;
             link(&mut self.scene, newest, limits.max_error_px, self.seed);
         }
-        self.let_go();
+        self.scene.let_go();
         limits
-    }
-
-    /// Images that stereo has no use for any more leave memory; features and sizes stay.
-    fn let_go(&mut self) {
-        let n = self.scene.views.len();
-        for (ix, view) in self.scene.views.iter_mut().enumerate() {
-            let is_old = view.registered.is_some() && ix + MAX_IMAGES < n;
-            let is_hopeless = ix + 2 * MAX_IMAGES < n;
-            if (is_old || is_hopeless) && !view.keyframe.frame.image.is_unloaded() {
-                view.keyframe = Arc::new(view.keyframe.unloaded());
-            }
-        }
     }
 
     /// Views of the keyframes that the batch before had, too.

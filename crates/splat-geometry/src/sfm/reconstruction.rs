@@ -21,6 +21,8 @@ use splat_types::image::RgbImage;
 use splat_types::transform::{Rigid, Similarity};
 
 pub(crate) const NONE: u32 = u32::MAX;
+/// Keyframes whose images are held, more than stereo reaches back; and twice as many that have no place.
+const MAX_IMAGES: usize = 128;
 
 /// A keyframe with what was found in it. Pixels and `lens` are of the working image, as a pinhole has them.
 #[derive(Debug)]
@@ -122,6 +124,18 @@ pub(crate) struct Reconstruction {
 impl Reconstruction {
     pub(crate) fn pixel(&self, (view, feature): (u32, u32)) -> DVec2 {
         self.views[view as usize].features.pixels[feature as usize]
+    }
+
+    /// Images that stereo has no use for any more leave memory; features and sizes stay.
+    pub(crate) fn let_go(&mut self) {
+        let n = self.views.len();
+        for (ix, view) in self.views.iter_mut().enumerate() {
+            let is_old = view.registered.is_some() && ix + MAX_IMAGES < n;
+            let is_hopeless = ix + 2 * MAX_IMAGES < n;
+            if (is_old || is_hopeless) && !view.keyframe.frame.image.is_unloaded() {
+                view.keyframe = Arc::new(view.keyframe.unloaded());
+            }
+        }
     }
 
     /// Where the image has it.

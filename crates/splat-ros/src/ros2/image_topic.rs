@@ -4,27 +4,17 @@
 
 use r2r::QosProfile;
 
+use crate::live_images::assembler::ReceivedImage;
 use crate::ros2::error::LinkError;
 use crate::ros2::node::Link;
 use crate::ros2::params::{ImageTransport, Reliability};
 use splat_io::queue::{Receiver, WhenFull, queue};
-use splat_io::survey::header_stamp;
 use splat_msgs::ros::{CompressedImage, Image, Message as _};
-use splat_types::time::{Stamp, Stopwatch};
 
 /// Images between the node's thread and the source's: a burst passes, and none is old when it is decoded.
 const MAX_IMAGES: usize = 4;
 /// Images that the middleware keeps until the node's thread takes them.
 const MAX_IN_MIDDLEWARE: usize = 10;
-
-/// An image as it came.
-#[derive(Debug)]
-pub(crate) struct ReceivedImage {
-    /// `None` where not even the header can be read.
-    pub(crate) stamp: Option<Stamp>,
-    pub(crate) payload: Vec<u8>,
-    pub(crate) age: Stopwatch,
-}
 
 /// The subscription, once it is known as what type.
 #[derive(Debug)]
@@ -49,12 +39,7 @@ impl Subscription {
         let qos = qos.keep_last(MAX_IN_MIDDLEWARE);
         let type_name = type_name(is_compressed);
         link.subscribe(&topic, type_name, qos, move |payload| {
-            let image = ReceivedImage {
-                stamp: header_stamp(&payload, 0),
-                payload,
-                age: Stopwatch::start(),
-            };
-            sender.send(image).is_ok()
+            sender.send(ReceivedImage::new(payload)).is_ok()
         })?;
         tracing::info!("{topic} is subscribed as {type_name}");
         Ok(Some(Self {

@@ -28,9 +28,6 @@ pub mod parameters;
 pub mod transport;
 
 #[cfg(feature = "ros2")]
-mod companion_topics;
-
-#[cfg(feature = "ros2")]
 mod image_topic;
 
 #[cfg(feature = "ros2")]

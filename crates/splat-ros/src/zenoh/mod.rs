@@ -11,3 +11,6 @@ pub mod transport;
 
 #[cfg(feature = "zenoh")]
 pub mod subscriber;
+
+#[cfg(feature = "zenoh")]
+pub mod source;

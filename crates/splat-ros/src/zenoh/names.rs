@@ -55,11 +55,16 @@ impl Names {
 
     /// Of a topic that others publish, below our namespace unless it begins with `/`; whatever hash they have for the type.
     pub(crate) fn incoming_key<T: Message>(&self, topic: &str) -> String {
+        self.incoming_key_of(topic, T::TYPE_NAME)
+    }
+
+    /// The same of a type by its name.
+    pub(crate) fn incoming_key_of(&self, topic: &str, type_name: &str) -> String {
         format!(
             "{}/{}/{}/*",
             self.domain_id,
             self.full(topic),
-            dds_name(T::TYPE_NAME)
+            dds_name(type_name)
         )
     }
 

@@ -1,14 +1,10 @@
-//! What comes beside the images: calibration, transforms, odometry, true poses, depth. Newest wins, old is forgotten.
+//! What comes beside live images: calibration, transforms, odometry, true poses, depth, a second camera. Newest wins, old is forgotten.
 //!
-//! Filled on the node's thread, asked on the source's.
+//! Filled on the threads of ROS 2 or zenoh, read on the source's.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use r2r::QosProfile;
-
-use crate::ros2::error::LinkError;
-use crate::ros2::node::Link;
 use splat_io::calibration::{is_rectified, lens_of_camera_info};
 use splat_io::ground_truth::{Track, Transforms};
 use splat_io::params::SourceParams;
@@ -33,7 +29,7 @@ const TRUTH_WITHIN_NANOS: i64 = 50_000_000;
 
 /// What was received so far.
 #[derive(Debug, Default)]
-struct CompanionState {
+pub(crate) struct CompanionState {
     info: Option<CameraInfo>,
     transforms: Transforms,
     /// The frame that moves, and its poses.
@@ -46,10 +42,14 @@ struct CompanionState {
     has_moving_transforms: bool,
 }
 
-/// The subscriptions beside the images.
+/// The topics beside the images, and what was received on them.
 #[derive(Debug)]
 pub(crate) struct Beside {
     received: Arc<Mutex<CompanionState>>,
+    pub(crate) info_topic: String,
+    odometry_topic: String,
+    pose_topic: String,
+    depth_topic: String,
     odom_frame: String,
     pub(crate) has_odometry_topic: bool,
     has_truth_topic: bool,
@@ -77,112 +77,88 @@ pub(crate) struct Companions {
     pub(crate) second: Option<Vec<u8>>,
 }
 
+/// What a topic beside the images brings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    CameraInfo,
+    SecondCameraInfo,
+    StaticTransforms,
+    Transforms,
+    Odometry,
+    TruePose,
+    Depth,
+    SecondImage,
+}
+
+/// A topic to subscribe, beside the images.
+#[derive(Debug, Clone)]
+pub(crate) struct CompanionTopic {
+    pub(crate) name: String,
+    pub(crate) type_name: &'static str,
+    pub(crate) kind: Kind,
+}
+
 impl Beside {
-    pub(crate) fn subscribe(
-        link: &Link,
-        info_topic: &str,
-        params: &SourceParams,
-    ) -> Result<Self, LinkError> {
-        let beside = Self {
+    /// For images whose calibration comes on `info_topic`.
+    pub(crate) fn new(params: &SourceParams, info_topic: &str, odom_frame: &str) -> Self {
+        Self {
             received: Arc::default(),
-            odom_frame: link.setup.odom_frame.clone(),
+            info_topic: info_topic.to_owned(),
+            odometry_topic: params.odometry_topic.clone(),
+            pose_topic: params.pose_topic.clone(),
+            depth_topic: params.depth_topic.clone(),
+            odom_frame: odom_frame.to_owned(),
             has_odometry_topic: !params.odometry_topic.is_empty(),
             has_truth_topic: !params.pose_topic.is_empty(),
             has_depth_topic: !params.depth_topic.is_empty(),
             depth_within_nanos: (1e9 * params.depth_tolerance) as u64,
             is_depth_compressed: is_compressed(&params.depth_topic),
             second: SecondTopics::of(params),
-        };
-        let sensor = QosProfile::sensor_data;
-        // Reliable publishers suit a best-effort listener, too; latched ones are asked for what they said before.
-        beside.receive::<CameraInfo>(link, info_topic, sensor(), |received, info| {
-            received.info = Some(info);
-        })?;
-        let latched = QosProfile::default().keep_last(100).transient_local();
-        beside.receive::<TfMessage>(link, "/tf_static", latched, |received, message| {
-            received.transforms.insert(&message, true);
-        })?;
-        let moving = QosProfile::default().keep_last(100).best_effort();
-        beside.receive::<TfMessage>(link, "/tf", moving.clone(), |received, message| {
-            received.has_moving_transforms = true;
-            received.transforms.insert(&message, false);
-            let newest = message.transforms.last().map(|t| t.header.stamp);
-            received.tidy(newest.map(Stamp::from));
-        })?;
-        if beside.has_odometry_topic {
-            beside.receive::<Odometry>(
-                link,
-                &params.odometry_topic,
-                moving.clone(),
-                |received, message| {
-                    let stamp = message.header.stamp.into();
-                    if let Some(pose) = message.pose.pose.to_rigid() {
-                        let base = message.child_frame_id;
-                        let (_, track) = received.odometry.get_or_insert((base, Track::default()));
-                        track.insert(stamp, pose);
-                    }
-                    received.tidy(Some(stamp));
-                },
-            )?;
         }
-        if beside.has_truth_topic {
-            beside.receive::<PoseStamped>(
-                link,
-                &params.pose_topic,
-                moving,
-                |received, message| {
-                    let stamp = message.header.stamp.into();
-                    if let Some(pose) = message.pose.to_rigid() {
-                        received.poses.insert(stamp, pose);
-                    }
-                    received.tidy(Some(stamp));
-                },
-            )?;
-        }
-        if beside.has_depth_topic {
-            let topic = (&*params.depth_topic, beside.is_depth_compressed);
-            beside.hold_images(link, topic, |received| &mut received.depths)?;
-        }
-        if let Some(second) = &beside.second {
-            let topic = (&*second.images, second.is_compressed);
-            beside.hold_images(link, topic, |received| &mut received.seconds)?;
-            beside.receive::<CameraInfo>(link, &second.info, sensor(), |received, info| {
-                received.second_info = Some(info);
-            })?;
-        }
-        Ok(beside)
     }
 
-    /// Holds the newest images of a topic as they come; whether they are compressed stands beside its name.
-    fn hold_images(
-        &self,
-        link: &Link,
-        (topic, is_compressed): (&str, bool),
-        held: impl Fn(&mut CompanionState) -> &mut VecDeque<(Stamp, Vec<u8>)> + Send + 'static,
-    ) -> Result<(), LinkError> {
-        let type_name = if is_compressed {
-            CompressedImage::TYPE_NAME
-        } else {
-            Image::TYPE_NAME
+    /// What is to be subscribed; each message goes to `sink`.
+    pub(crate) fn topics(&self) -> Vec<CompanionTopic> {
+        let image = |is_compressed| {
+            if is_compressed {
+                CompressedImage::TYPE_NAME
+            } else {
+                Image::TYPE_NAME
+            }
         };
+        let mut topics = Vec::new();
+        let mut add = |name: &str, type_name, kind| {
+            if !name.is_empty() {
+                topics.push(CompanionTopic {
+                    name: name.to_owned(),
+                    type_name,
+                    kind,
+                });
+            }
+        };
+        add(&self.info_topic, CameraInfo::TYPE_NAME, Kind::CameraInfo);
+        add("/tf_static", TfMessage::TYPE_NAME, Kind::StaticTransforms);
+        add("/tf", TfMessage::TYPE_NAME, Kind::Transforms);
+        add(&self.odometry_topic, Odometry::TYPE_NAME, Kind::Odometry);
+        add(&self.pose_topic, PoseStamped::TYPE_NAME, Kind::TruePose);
+        let depth_type = image(self.is_depth_compressed);
+        add(&self.depth_topic, depth_type, Kind::Depth);
+        if let Some(second) = &self.second {
+            let second_type = image(second.is_compressed);
+            add(&second.images, second_type, Kind::SecondImage);
+            add(&second.info, CameraInfo::TYPE_NAME, Kind::SecondCameraInfo);
+        }
+        topics
+    }
+
+    /// Takes the messages of one topic. Those that do not decode are left out: what they lack shows where it is missed.
+    pub(crate) fn sink(&self, kind: Kind) -> impl Fn(Vec<u8>) + Send + Sync + 'static {
         let received = Arc::clone(&self.received);
-        link.subscribe(
-            topic,
-            type_name,
-            QosProfile::sensor_data(),
-            move |payload| {
-                if let Some(stamp) = header_stamp(&payload, 0) {
-                    let mut received = lock(&received);
-                    let images = held(&mut received);
-                    images.push_back((stamp, payload));
-                    let n_bytes: usize = images.iter().map(|(_, payload)| payload.len()).sum();
-                    if images.len() > MAX_DEPTHS || n_bytes > MAX_DEPTH_BYTES {
-                        images.pop_front();
-                    }
-                }
-                true
-            },
-        )
+        move |payload| {
+            if let Err(reason) = lock(&received).take(kind, payload) {
+                tracing::debug!("a message is left out: {reason}");
+            }
+        }
     }
 
     /// Lens of the second camera and how it is mounted, once its calibration has come; `None` where the topics say neither.
@@ -202,24 +178,6 @@ impl Beside {
             is_pair(&mounted).then_some(mounted)
         };
         Some((lens, by_calibration.or_else(by_transforms)?))
-    }
-
-    /// Messages that do not decode are left out: what they lack shows where it is missed.
-    fn receive<T: Message + serde::de::DeserializeOwned>(
-        &self,
-        link: &Link,
-        topic: &str,
-        qos: QosProfile,
-        mut note: impl FnMut(&mut CompanionState, T) + Send + 'static,
-    ) -> Result<(), LinkError> {
-        let received = Arc::clone(&self.received);
-        link.subscribe(topic, T::TYPE_NAME, qos, move |payload| {
-            match ros::decode::<T>(&payload) {
-                Ok(message) => note(&mut lock(&received), message),
-                Err(e) => tracing::debug!("a message is left out: {e}"),
-            }
-            true
-        })
     }
 
     /// The lens by the newest calibration; `None` before the first.
@@ -290,6 +248,7 @@ impl Beside {
     }
 
     /// Time begins anew: what moved before is of no use, how things are mounted is.
+    #[cfg(feature = "ros2")]
     pub(crate) fn forget_times(&self) {
         let mut received = lock(&self.received);
         received
@@ -303,6 +262,44 @@ impl Beside {
 }
 
 impl CompanionState {
+    fn take(&mut self, kind: Kind, payload: Vec<u8>) -> Result<(), String> {
+        match kind {
+            Kind::CameraInfo => self.info = Some(decoded(&payload)?),
+            Kind::SecondCameraInfo => self.second_info = Some(decoded(&payload)?),
+            Kind::StaticTransforms => {
+                self.transforms.insert(&decoded(&payload)?, true);
+            }
+            Kind::Transforms => {
+                let message: TfMessage = decoded(&payload)?;
+                self.has_moving_transforms = true;
+                self.transforms.insert(&message, false);
+                let newest = message.transforms.last().map(|t| t.header.stamp);
+                self.tidy(newest.map(Stamp::from));
+            }
+            Kind::Odometry => {
+                let message: Odometry = decoded(&payload)?;
+                let stamp = message.header.stamp.into();
+                if let Some(pose) = message.pose.pose.to_rigid() {
+                    let base = message.child_frame_id;
+                    let (_, track) = self.odometry.get_or_insert((base, Track::default()));
+                    track.insert(stamp, pose);
+                }
+                self.tidy(Some(stamp));
+            }
+            Kind::TruePose => {
+                let message: PoseStamped = decoded(&payload)?;
+                let stamp = message.header.stamp.into();
+                if let Some(pose) = message.pose.to_rigid() {
+                    self.poses.insert(stamp, pose);
+                }
+                self.tidy(Some(stamp));
+            }
+            Kind::Depth => hold(&mut self.depths, payload)?,
+            Kind::SecondImage => hold(&mut self.seconds, payload)?,
+        }
+        Ok(())
+    }
+
     fn tidy(&mut self, newest: Option<Stamp>) {
         self.n_messages += 1;
         let Some(newest) = newest.filter(|_| self.n_messages >= TIDY_EVERY) else {
@@ -345,6 +342,21 @@ fn nearest(held: &VecDeque<(Stamp, Vec<u8>)>, stamp: Stamp, within_nanos: u64) -
     let nearest = held.iter().min_by_key(off);
     let near = nearest.filter(|image| off(image) <= within_nanos);
     near.map(|(_, payload)| payload.clone())
+}
+
+fn decoded<T: Message + serde::de::DeserializeOwned>(payload: &[u8]) -> Result<T, String> {
+    ros::decode(payload).map_err(|e| e.to_string())
+}
+
+/// Holds the newest images.
+fn hold(images: &mut VecDeque<(Stamp, Vec<u8>)>, payload: Vec<u8>) -> Result<(), String> {
+    let stamp = header_stamp(&payload, 0).ok_or("an image without a CDR header")?;
+    images.push_back((stamp, payload));
+    let n_bytes: usize = images.iter().map(|(_, payload)| payload.len()).sum();
+    if images.len() > MAX_DEPTHS || n_bytes > MAX_DEPTH_BYTES {
+        images.pop_front();
+    }
+    Ok(())
 }
 
 /// Whether the images of a topic are compressed, by the name that image_transport gives it.
