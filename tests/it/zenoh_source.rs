@@ -3,7 +3,7 @@
 
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::Value;
 use zenoh::{Session, Wait};
@@ -11,6 +11,7 @@ use zenoh::{Session, Wait};
 use crate::over_zenoh::{PATIENCE, client, free_endpoint};
 use crate::scenes::scene;
 use splat_msgs::type_hash::dds_name;
+use splat_types::time::Stopwatch;
 
 const N_FRAMES: usize = 60;
 const IMAGES: &str = "/camera/image_raw/compressed";
@@ -21,12 +22,12 @@ fn send(session: &Session, bag: &Path) {
     let key = |topic: &str, type_name: &str| format!("0{topic}/{}/RIHS01_00", dds_name(type_name));
     let images = session.declare_publisher(key(IMAGES, "sensor_msgs/msg/CompressedImage"));
     let images = images.wait().unwrap();
-    let started = Instant::now();
+    let started = Stopwatch::start();
     while !images.matching_status().wait().unwrap().matching() {
         assert!(started.elapsed() < PATIENCE, "nobody subscribes the images");
         std::thread::sleep(Duration::from_millis(50));
     }
-    let (watch, mut first, mut n_images) = (Instant::now(), None, 0);
+    let (watch, mut first, mut n_images) = (Stopwatch::start(), None, 0);
     for message in mcap::MessageStream::new(&bytes).unwrap() {
         let message = message.unwrap();
         let at = Duration::from_nanos(message.log_time);
