@@ -106,3 +106,17 @@ pub trait Source: Send {
     /// A source that waits for the world ends `next` with `None` soon after the end is asked for.
     fn end_when(&mut self, _asked: &Arc<AtomicBool>) {}
 }
+
+/// How long one look for the next frame of a waiting source lasts.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// `Source::next` of a source that waits for the world: looks until there is a frame, or the end.
+pub fn next_polled(source: &mut impl Source) -> Option<Frame> {
+    loop {
+        match source.poll(LOOK) {
+            Polled::Frame(frame) => return Some(*frame),
+            Polled::Waiting => {}
+            Polled::Ended => return None,
+        }
+    }
+}

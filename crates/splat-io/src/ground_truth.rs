@@ -264,6 +264,32 @@ impl Transforms {
         Self::along(&chain, |_| None)
     }
 
+    /// `to_from_from` of two frames on one body, of which neither need be above the other.
+    pub fn between(&self, to: &str, from: &str) -> Option<Rigid> {
+        let (above_to, above_from) = (self.fixed_above(to), self.fixed_above(from));
+        above_from.iter().find_map(|(name, top_from_from)| {
+            let (_, top_from_to) = above_to.iter().find(|(other, _)| other == name)?;
+            Some(top_from_to.inverse() * *top_from_from)
+        })
+    }
+
+    /// A frame and those above it by links that never move, each with `above_from_frame`.
+    fn fixed_above<'a>(&'a self, frame: &'a str) -> Vec<(&'a str, Rigid)> {
+        let mut above = vec![(frame.trim_start_matches('/'), Rigid::IDENTITY)];
+        while let Some((name, from_frame)) = above.last().copied()
+            && above.len() <= MAX_CHAIN
+        {
+            let Some(link) = self.links.get(name).filter(|link| link.is_static) else {
+                break;
+            };
+            let Some(parent_from_child) = link.track.by_nanos.values().next_back() else {
+                break;
+            };
+            above.push((&link.parent, *parent_from_child * from_frame));
+        }
+        above
+    }
+
     /// Links from the camera up to `world`.
     fn chain(&self, camera_frame: &str, world: &str) -> Option<Vec<&Link>> {
         let mut chain = Vec::new();

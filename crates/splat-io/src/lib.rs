@@ -42,6 +42,8 @@ pub mod survey;
 
 pub mod camera_info;
 
+pub mod depth_registration;
+
 pub mod second_camera;
 
 pub mod topics;

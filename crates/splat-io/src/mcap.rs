@@ -7,6 +7,7 @@ use std::path::Path;
 
 use crate::bag::{Bag, files_of, not_mcap};
 use crate::camera_info;
+use crate::depth_registration::{Calibrated, Registration, registration};
 use crate::error::SourceError;
 use crate::frame_source::{MetricInput, Source, SourceCounts};
 use crate::ground_truth::{GroundTruth, Odometry, half_interval};
@@ -16,7 +17,7 @@ use crate::ros_image::decode_into;
 use crate::second_camera::SecondCamera;
 use crate::survey::{Survey, header_stamp};
 use crate::topics::{
-    depth_topic_of, image_topic_of, lens_of, odometry_of, second_topic_of, truth_of,
+    depth_topic_of, image_topic_of, info_beside, lens_of, odometry_of, second_topic_of, truth_of,
 };
 use splat_image::jpeg::decoder::Jpeg;
 use splat_msgs::ros::{self, CompressedImage, Image};
@@ -59,6 +60,45 @@ struct DepthTopic {
     is_compressed: bool,
     /// Depth belongs to the image whose stamp is nearest, if it is as near as that.
     within_nanos: u64,
+    registration: Registration,
+}
+
+impl DepthTopic {
+    /// `None`, and a warning, where nothing says how depth lies to colour.
+    fn of(name: String, survey: &Survey, image_topic: &str, params: &SourceParams) -> Option<Self> {
+        let frame_of = |topic: &str| survey.topics.get(topic).map_or("", |t| t.frame_id.as_str());
+        let of = |topic: &str, info_topic: &str| Calibrated {
+            frame_id: frame_of(topic),
+            info: survey.infos.get(info_topic),
+        };
+        let colour_info = if params.camera_info_topic.is_empty() {
+            info_beside(image_topic)
+        } else {
+            params.camera_info_topic.clone()
+        };
+        let colour = of(image_topic, &colour_info);
+        let depth = of(&name, &info_beside(&name));
+        let registration = registration(&colour, &depth, &survey.transforms);
+        match &registration {
+            Registration::Aligned => (),
+            Registration::By(_) => {
+                tracing::info!("depth images are registered to the colour camera by tf");
+            }
+            Registration::Unknown(reason) => {
+                tracing::warn!("{reason}; depth images are left out");
+                return None;
+            }
+        }
+        Some(Self {
+            is_compressed: survey
+                .topics
+                .get(&name)
+                .is_some_and(|topic| topic.is_compressed()),
+            within_nanos: (1e9 * params.depth_tolerance) as u64,
+            registration,
+            name,
+        })
+    }
 }
 
 #[derive(Debug)]
@@ -100,14 +140,8 @@ impl McapSource {
                 "more poses than are kept: frames late in the recording have no ground truth"
             );
         }
-        let depth_topic = depth_topic_of(&survey, params).map(|name| DepthTopic {
-            is_compressed: survey
-                .topics
-                .get(&name)
-                .is_some_and(|topic| topic.is_compressed()),
-            within_nanos: (1e9 * params.depth_tolerance) as u64,
-            name,
-        });
+        let depth_topic = depth_topic_of(&survey, params)
+            .and_then(|name| DepthTopic::of(name, &survey, &image_topic, params));
         let second = second_topic_of(&survey, &image_topic, params).map(|topic| PairedTopic {
             name: topic.name,
             within_nanos: (1e9 * params.stereo_tolerance) as u64,
@@ -254,9 +288,13 @@ impl McapSource {
 impl McapSource {
     /// The depth map that is nearest in time, if it is near enough. Images without one are counted.
     fn depth_at(&mut self, stamp: Stamp) -> Option<DepthMap> {
-        let topic = self.topics.depth.as_ref()?;
+        let topic = self.topics.depth.as_mut()?;
         let nearest = nearest(&self.depths, stamp, topic.within_nanos);
-        match nearest.map(|depth| depth_of(&depth.payload, topic.is_compressed)) {
+        let decoded = nearest.map(|depth| {
+            let depth = depth_of(&depth.payload, topic.is_compressed)?;
+            topic.registration.apply(depth)
+        });
+        match decoded {
             Some(Ok(depth)) => return Some(depth),
             Some(Err(reason)) => {
                 let text = format!("depth images are left out: {reason}");

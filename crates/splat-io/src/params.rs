@@ -16,8 +16,8 @@ pub struct SourceParams {
     pub camera_info_url: String,
     /// PoseStamped ground truth (camera to world); empty takes the first found, tf next.
     pub pose_topic: String,
-    /// Depth images in the pixels of the colour camera (16UC1 mm or 32FC1 m, raw or compressedDepth) for geometry
-    /// rgbd and ground_truth; of a recording, empty takes the first found.
+    /// Depth images (16UC1 mm or 32FC1 m, raw or compressedDepth) for geometry rgbd and ground_truth, aligned to colour
+    /// or with CameraInfo and tf of their own; of a recording, empty takes the first found.
     pub depth_topic: String,
     /// A depth image belongs to the colour image whose stamp is nearest, if they are no farther apart.
     #[schemars(range(min = 0.0, max = 1.0), extend("unit" = "s"))]

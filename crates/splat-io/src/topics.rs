@@ -133,7 +133,7 @@ pub(crate) fn second_topic_of(
     let by_calibration = second_from_first((image_topic, first), (&name, second));
     let frames = survey.topics.get(image_topic).map(|first| &first.frame_id);
     let by_transforms = || {
-        let second_from_first = survey.transforms.fixed(&topic.frame_id, frames?)?;
+        let second_from_first = survey.transforms.between(&topic.frame_id, frames?)?;
         is_pair(&second_from_first).then_some(second_from_first)
     };
     let mounted = by_calibration.or_else(by_transforms);

@@ -97,11 +97,12 @@ pub(crate) fn drop_wrong_depth(
     if let Some(off) = off.filter(|off| off.abs() > MAX_OFF) {
         let percent = 100.0 * (off.exp() - 1.0);
         let id = scene.views[view_ix].keyframe.id;
-        tracing::debug!(
-            id,
-            percent,
-            "measured depth disagrees with the landmarks and is left out"
-        );
+        tracing::debug!(id, percent, "measured depth is left out");
+        if scene.n_wrong_depths == 0 {
+            tracing::warn!(
+                "measured depth of keyframe {id} is {percent:.0} % off what the map has there and is left out, and so is that of others like it; said once"
+            );
+        }
         scene.views[view_ix].measured = None;
         scene.n_wrong_depths += 1;
     }

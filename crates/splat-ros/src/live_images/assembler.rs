@@ -3,6 +3,7 @@
 //! What is decoded is decoded on the source's thread, by the same code as recordings.
 
 use crate::live_images::companions::{Beside, Companions};
+use splat_io::depth_registration::Registration;
 use splat_io::frame_source::{MetricInput, SourceCounts};
 use splat_io::intake::{Extras, Intake};
 use splat_io::mcap::{depth_of, image_of};
@@ -53,6 +54,8 @@ pub(crate) struct Assembler {
     /// Made with the first frame, when the lens is known or given up.
     intake: Option<Intake>,
     second: Option<SecondCamera>,
+    /// Of depth images, known with the first of them.
+    registration: Option<Registration>,
     /// Before there is an intake.
     n_unreadable: u64,
     uses_transforms: bool,
@@ -71,6 +74,7 @@ impl Assembler {
             topic: topic.to_owned(),
             intake: None,
             second: None,
+            registration: None,
             n_unreadable: 0,
             uses_transforms: false,
         }
@@ -142,7 +146,8 @@ impl Assembler {
             self.camera_frame = header_frame(&image.payload).unwrap_or_default();
             let second = self.beside.second_camera(&self.topic, &self.camera_frame);
             let has_second = self.beside.second.is_none() || second.is_some();
-            let has_lens = self.beside.lens(&self.topic).is_some() && has_second;
+            let has_depth_info = self.beside.has_depth_info() || waited > SETTLE_SECS;
+            let has_lens = self.beside.lens(&self.topic).is_some() && has_second && has_depth_info;
             let is_settled = waited > SETTLE_SECS && !self.beside.has_moving_transforms();
             let has_odometry = self.beside.reaches_odometry(&self.camera_frame)
                 || self.beside.has_odometry_topic
@@ -220,7 +225,12 @@ impl Assembler {
         };
         let arrival = intake.arrive(stamp)?;
         let sensor_depth = companions.depth.and_then(|payload| {
+            let registration = self.registration.get_or_insert_with(|| {
+                let depth_frame = header_frame(&payload).unwrap_or_default();
+                self.beside.registration(&self.camera_frame, &depth_frame)
+            });
             let depth = depth_of(&payload, self.beside.is_depth_compressed);
+            let depth = depth.and_then(|depth| registration.apply(depth));
             let complain = |reason: &String| {
                 intake.warn_once("depth", &format!("depth images are left out: {reason}"));
             };

@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use splat_io::calibration::{is_rectified, lens_of_camera_info};
+use splat_io::depth_registration::{Calibrated, Registration, registration};
 use splat_io::ground_truth::{Track, Transforms};
 use splat_io::params::SourceParams;
 use splat_io::second_camera::{is_pair, second_from_first};
@@ -38,6 +39,7 @@ pub(crate) struct CompanionState {
     depths: VecDeque<(Stamp, Vec<u8>)>,
     seconds: VecDeque<(Stamp, Vec<u8>)>,
     second_info: Option<CameraInfo>,
+    depth_info: Option<CameraInfo>,
     n_messages: u32,
     has_moving_transforms: bool,
 }
@@ -82,6 +84,7 @@ pub(crate) struct Companions {
 pub(crate) enum Kind {
     CameraInfo,
     SecondCameraInfo,
+    DepthCameraInfo,
     StaticTransforms,
     Transforms,
     Odometry,
@@ -143,6 +146,10 @@ impl Beside {
         add(&self.pose_topic, PoseStamped::TYPE_NAME, Kind::TruePose);
         let depth_type = image(self.is_depth_compressed);
         add(&self.depth_topic, depth_type, Kind::Depth);
+        if self.has_depth_topic {
+            let info_topic = info_beside(&self.depth_topic);
+            add(&info_topic, CameraInfo::TYPE_NAME, Kind::DepthCameraInfo);
+        }
         if let Some(second) = &self.second {
             let second_type = image(second.is_compressed);
             add(&second.images, second_type, Kind::SecondImage);
@@ -161,6 +168,25 @@ impl Beside {
         }
     }
 
+    /// Whether the calibration of the depth camera has come, where there is a depth topic.
+    pub(crate) fn has_depth_info(&self) -> bool {
+        !self.has_depth_topic || lock(&self.received).depth_info.is_some()
+    }
+
+    /// How depth images of a frame lie to the images.
+    pub(crate) fn registration(&self, camera_frame: &str, depth_frame: &str) -> Registration {
+        let received = lock(&self.received);
+        let colour = Calibrated {
+            frame_id: camera_frame,
+            info: received.info.as_ref(),
+        };
+        let depth = Calibrated {
+            frame_id: depth_frame,
+            info: received.depth_info.as_ref(),
+        };
+        registration(&colour, &depth, &received.transforms)
+    }
+
     /// Lens of the second camera and how it is mounted, once its calibration has come; `None` where the topics say neither.
     pub(crate) fn second_camera(
         &self,
@@ -174,7 +200,7 @@ impl Beside {
         let by_calibration = second_from_first((image_topic, first), (&topics.images, second));
         let by_transforms = || {
             let frame = &second.header.frame_id;
-            let mounted = received.transforms.fixed(frame, camera_frame)?;
+            let mounted = received.transforms.between(frame, camera_frame)?;
             is_pair(&mounted).then_some(mounted)
         };
         Some((lens, by_calibration.or_else(by_transforms)?))
@@ -265,6 +291,7 @@ impl CompanionState {
     fn take(&mut self, kind: Kind, payload: Vec<u8>) -> Result<(), String> {
         match kind {
             Kind::CameraInfo => self.info = Some(decoded(&payload)?),
+            Kind::DepthCameraInfo => self.depth_info = Some(decoded(&payload)?),
             Kind::SecondCameraInfo => self.second_info = Some(decoded(&payload)?),
             Kind::StaticTransforms => {
                 self.transforms.insert(&decoded(&payload)?, true);

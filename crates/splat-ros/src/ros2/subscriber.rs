@@ -15,7 +15,7 @@ use crate::ros2::node::Link;
 use crate::ros2::params::OnTimeJump;
 use crate::ros2::topic_watch::{Watch, why_silent};
 use splat_io::error::SourceError;
-use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts};
+use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
 use splat_io::params::SourceParams;
 use splat_io::queue::Received;
 use splat_io::topics::info_beside;
@@ -195,13 +195,7 @@ fn subscribe(beside: &Beside, link: &Link) -> Result<(), LinkError> {
 
 impl Source for Ros2Source {
     fn next(&mut self) -> Option<Frame> {
-        loop {
-            match self.poll(Duration::from_secs(1)) {
-                Polled::Frame(frame) => return Some(*frame),
-                Polled::Waiting => {}
-                Polled::Ended => return None,
-            }
-        }
+        next_polled(self)
     }
 
     fn poll(&mut self, patience: Duration) -> Polled {

@@ -15,7 +15,7 @@ use crate::params::PublishParams;
 use crate::zenoh::names::Names;
 use crate::zenoh::session::open_session;
 use splat_io::error::SourceError;
-use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts};
+use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
 use splat_io::params::SourceParams;
 use splat_io::queue::{Received, Receiver, Sender, WhenFull, queue};
 use splat_io::topics::info_beside;
@@ -182,13 +182,7 @@ fn subscribe(
 
 impl Source for ZenohSource {
     fn next(&mut self) -> Option<Frame> {
-        loop {
-            match self.poll(Duration::from_secs(1)) {
-                Polled::Frame(frame) => return Some(*frame),
-                Polled::Waiting => {}
-                Polled::Ended => return None,
-            }
-        }
+        next_polled(self)
     }
 
     fn poll(&mut self, patience: Duration) -> Polled {
