@@ -6,6 +6,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
+use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
 use crate::over_zenoh::{PATIENCE, client, free_endpoint};
@@ -40,6 +41,8 @@ fn send(session: &Session, bag: &Path) {
         let type_name = &message.channel.schema.as_ref().unwrap().name;
         session
             .put(key(topic, type_name), message.data.to_vec())
+            // By default zenoh drops at the sender what a busy machine does not take.
+            .congestion_control(CongestionControl::Block)
             .wait()
             .unwrap();
         n_images += usize::from(topic == IMAGES);
