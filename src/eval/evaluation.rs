@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde::Serialize;
 
 use crate::eval::alignment::{AlignError, Alignment, align};
@@ -61,7 +61,7 @@ pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalErro
     };
     let metres_per_unit = report.as_ref().and_then(|r| r.scale.metres_per_unit);
     let quality = report.map(|report| report.quality);
-    let evaluation = compare(&keyframes, &truth);
+    let evaluation = compare_at(&keyframes, &truth, metres_per_unit);
     if evaluation.registered == 0 {
         return Err(EvalError::NothingInCommon {
             run: span(&keyframes),
@@ -70,37 +70,23 @@ pub fn evaluate(run_dir: &Path, reference: &Path) -> Result<Evaluation, EvalErro
             path: reference.to_owned(),
         });
     }
-    let ate_se3_rmse = metres_per_unit.and_then(|m| ate_se3(&keyframes, &truth, m));
     Ok(Evaluation {
         quality,
-        ate_se3_rmse,
         ..evaluation
     })
 }
 
-/// Root mean square distance of positions in metres after the best rigid motion.
-fn ate_se3(keyframes: &[TimedPose], reference: &[TimedPose], metres_per_unit: f64) -> Option<f64> {
-    let offset_nanos = stamp_offset_nanos(keyframes, reference, TOLERANCE_SECS);
-    let keyframes = shifted(keyframes, offset_nanos);
-    let pairs = associate(&keyframes, reference, TOLERANCE_SECS);
-    let own: Vec<Rigid> = pairs.iter().map(|&(ix, _)| keyframes[ix].pose).collect();
-    let truth: Vec<Rigid> = pairs.iter().map(|&(_, ix)| reference[ix].pose).collect();
-    // The best turn about the middles is the same whatever the scale.
-    let turn = align(&own, &truth).ok()?.reference_from_estimate.rotation;
-    let middle = |poses: &[Rigid]| {
-        let sum: DVec3 = poses.iter().map(|pose| pose.translation).sum();
-        sum / poses.len() as f64
-    };
-    let (own_middle, true_middle) = (middle(&own), middle(&truth));
-    let off = own.iter().zip(&truth).map(|(own, truth)| {
-        let turned = turn * (own.translation - own_middle) * metres_per_unit;
-        turned.distance(truth.translation - true_middle)
-    });
-    Some(rmse(off))
-}
-
 /// The figures for two trajectories in order of time.
 pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
+    compare_at(keyframes, reference, None)
+}
+
+/// The same of a run whose unit is so many metres, where that is known.
+fn compare_at(
+    keyframes: &[TimedPose],
+    reference: &[TimedPose],
+    metres_per_unit: Option<f64>,
+) -> Evaluation {
     let offset_nanos = stamp_offset_nanos(keyframes, reference, TOLERANCE_SECS);
     let keyframes = &shifted(keyframes, offset_nanos)[..];
     let pairs = associate(keyframes, reference, TOLERANCE_SECS);
@@ -140,6 +126,10 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
             .zip(&truth)
             .map(|(a, t)| a.translation.distance(t.translation)),
     );
+    let ate_se3_rmse = metres_per_unit.map(|metres| {
+        let rigid = (similarity.rotation, metres);
+        ate_se3(&estimated, &truth, rigid)
+    });
     let positions: Vec<DVec3> = reference
         .iter()
         .map(|timed| timed.pose.translation)
@@ -151,6 +141,7 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         .collect();
     Evaluation {
         ate_rmse: Some(ate),
+        ate_se3_rmse,
         ate_percent_of_extent: Some(100.0 * ate / extent(&positions)),
         rotation_mean_deg: Some(mean_angle_deg(&similarity, &estimated, &truth)),
         rpe_translation: Some(rmse(
@@ -168,6 +159,19 @@ pub fn compare(keyframes: &[TimedPose], reference: &[TimedPose]) -> Evaluation {
         ),
         ..empty
     }
+}
+
+/// Root mean square distance of positions about their middles, in metres. The best turn is the same whatever the scale.
+fn ate_se3(estimate: &[Rigid], truth: &[Rigid], (turn, metres_per_unit): (DQuat, f64)) -> f64 {
+    let middle = |poses: &[Rigid]| {
+        let sum: DVec3 = poses.iter().map(|pose| pose.translation).sum();
+        sum / poses.len() as f64
+    };
+    let (own_middle, true_middle) = (middle(estimate), middle(truth));
+    rmse(estimate.iter().zip(truth).map(|(own, truth)| {
+        let turned = turn * (own.translation - own_middle) * metres_per_unit;
+        turned.distance(truth.translation - true_middle)
+    }))
 }
 
 fn mean_angle_deg(similarity: &Similarity, estimate: &[Rigid], truth: &[Rigid]) -> f64 {

@@ -77,7 +77,9 @@ pub trait Source: Send {
     fn counts(&self) -> SourceCounts;
 
     /// Frames still to come, where the source knows (for the progress bar).
-    fn len_hint(&self) -> Option<u64>;
+    fn len_hint(&self) -> Option<u64> {
+        None
+    }
 
     /// Images still to come, where somebody chose each of them: photos in a folder or in a scene of another program. `None` for
     /// the frames of a camera, recorded or not, which repeat themselves.
@@ -86,7 +88,9 @@ pub trait Source: Send {
     }
 
     /// Largest distance between two true camera positions of the whole input, where they are known beforehand.
-    fn truth_extent(&self) -> Option<f64>;
+    fn truth_extent(&self) -> Option<f64> {
+        None
+    }
 
     /// What the frames bring besides one colour image that shows lengths.
     fn metric_input(&self) -> MetricInput {

@@ -17,7 +17,8 @@ use crate::ros_image::decode_into;
 use crate::second_camera::SecondCamera;
 use crate::survey::{Survey, header_stamp};
 use crate::topics::{
-    depth_topic_of, image_topic_of, info_beside, lens_of, odometry_of, second_topic_of, truth_of,
+    depth_topic_of, image_topic_of, info_beside, info_topic_of, lens_of, odometry_of,
+    second_topic_of, truth_of,
 };
 use splat_image::jpeg::decoder::Jpeg;
 use splat_msgs::ros::{self, CompressedImage, Image};
@@ -71,11 +72,7 @@ impl DepthTopic {
             frame_id: frame_of(topic),
             info: survey.infos.get(info_topic),
         };
-        let colour_info = if params.camera_info_topic.is_empty() {
-            info_beside(image_topic)
-        } else {
-            params.camera_info_topic.clone()
-        };
+        let colour_info = info_topic_of(&params.camera_info_topic, image_topic);
         let colour = of(image_topic, &colour_info);
         let depth = of(&name, &info_beside(&name));
         let registration = registration(&colour, &depth, &survey.transforms);

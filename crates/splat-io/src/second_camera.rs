@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::calibration::is_rectified;
+use crate::ground_truth::Transforms;
 use crate::intake::{Extras, Intake};
 use crate::params::SourceParams;
 use crate::ros_image::decode_into;
@@ -39,7 +40,7 @@ pub fn partner_of(image_topic: &str) -> Option<String> {
 /// How the second camera is mounted, by the calibrations of a rectified pair (REP 104): the first column of P that differs is
 /// `-fx` times the baseline, and R turns each camera into the rectified pair. `second_from_first`, of the images as they come.
 /// `None` where the calibrations are those of single cameras.
-pub fn second_from_first(
+fn second_from_first(
     (first_topic, first): (&str, &CameraInfo),
     (second_topic, second): (&str, &CameraInfo),
 ) -> Option<Rigid> {
@@ -54,8 +55,28 @@ pub fn second_from_first(
     is_pair(&mounted).then_some(mounted)
 }
 
+/// A camera of a pair: its image topic, the frame of its images, its calibration.
+#[derive(Debug, Clone, Copy)]
+pub struct OfPair<'a> {
+    pub topic: &'a str,
+    pub frame_id: &'a str,
+    pub info: &'a CameraInfo,
+}
+
+/// How the second camera is mounted, by both calibrations, else by the fixed transforms between their frames. `None` where neither
+/// says so.
+pub fn mounted(first: &OfPair<'_>, second: &OfPair<'_>, transforms: &Transforms) -> Option<Rigid> {
+    let by_calibration = second_from_first((first.topic, first.info), (second.topic, second.info));
+    let by_transforms = || {
+        transforms
+            .between(second.frame_id, first.frame_id)
+            .filter(is_pair)
+    };
+    by_calibration.or_else(by_transforms)
+}
+
 /// Whether two cameras mounted like that can be a stereo pair.
-pub fn is_pair(second_from_first: &Rigid) -> bool {
+fn is_pair(second_from_first: &Rigid) -> bool {
     second_from_first.is_finite() && BASELINES.contains(&second_from_first.translation.length())
 }
 

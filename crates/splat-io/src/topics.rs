@@ -7,7 +7,7 @@ use crate::calibration::{is_rectified, lens_of_camera_info};
 use crate::error::SourceError;
 use crate::ground_truth::{GroundTruth, Odometry};
 use crate::params::SourceParams;
-use crate::second_camera::{is_pair, partner_of, second_from_first};
+use crate::second_camera::{OfPair, mounted, partner_of};
 use crate::survey::{Survey, Topic};
 use splat_types::camera::CameraModel;
 use splat_types::transform::Rigid;
@@ -65,6 +65,15 @@ pub fn info_beside(image_topic: &str) -> String {
     )
 }
 
+/// The CameraInfo topic of an image topic: the one that is named, else the one beside it.
+pub fn info_topic_of(named: &str, image_topic: &str) -> String {
+    if named.is_empty() {
+        info_beside(image_topic)
+    } else {
+        named.to_owned()
+    }
+}
+
 pub(crate) fn depth_topic_of(survey: &Survey, params: &SourceParams) -> Option<String> {
     if params.depth_topic.is_empty() {
         return survey
@@ -113,15 +122,8 @@ pub(crate) fn second_topic_of(
         complain(&format!("no images on {name:?}"));
         return None;
     };
-    let info_topic = |own: &str, image: &str| {
-        if own.is_empty() {
-            info_beside(image)
-        } else {
-            own.to_owned()
-        }
-    };
-    let first_topic = info_topic(&params.camera_info_topic, image_topic);
-    let second_topic = info_topic(&params.second_camera_info_topic, &name);
+    let first_topic = info_topic_of(&params.camera_info_topic, image_topic);
+    let second_topic = info_topic_of(&params.second_camera_info_topic, &name);
     let infos = survey.infos.get(&first_topic);
     let Some((first, second)) = infos.zip(survey.infos.get(&second_topic)) else {
         complain(&format!(
@@ -130,13 +132,17 @@ pub(crate) fn second_topic_of(
         return None;
     };
     let lens = lens_of_camera_info(second, is_rectified(&name, second)).ok()?;
-    let by_calibration = second_from_first((image_topic, first), (&name, second));
-    let frames = survey.topics.get(image_topic).map(|first| &first.frame_id);
-    let by_transforms = || {
-        let second_from_first = survey.transforms.between(&topic.frame_id, frames?)?;
-        is_pair(&second_from_first).then_some(second_from_first)
+    let first = OfPair {
+        topic: image_topic,
+        frame_id: survey.topics.get(image_topic)?.frame_id.as_str(),
+        info: first,
     };
-    let mounted = by_calibration.or_else(by_transforms);
+    let of_second = OfPair {
+        topic: &name,
+        frame_id: &topic.frame_id,
+        info: second,
+    };
+    let mounted = mounted(&first, &of_second, &survey.transforms);
     if mounted.is_none() {
         complain(&format!(
             "neither P of {second_topic:?} nor /tf_static says how far the cameras are apart"

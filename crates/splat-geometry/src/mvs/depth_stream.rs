@@ -349,12 +349,6 @@ impl DepthStream {
         self.matcher.as_ref()
     }
 
-    /// Width and height of the depth map of a keyframe. `None`: not held.
-    pub fn size_of(&self, keyframe_id: u32) -> Option<(u32, u32)> {
-        let grey = &self.held.get(&keyframe_id)?.prepared.grey;
-        Some((grey.width as u32, grey.height as u32))
-    }
-
     pub fn holds(&self, keyframe_id: u32) -> bool {
         self.held.contains_key(&keyframe_id)
     }

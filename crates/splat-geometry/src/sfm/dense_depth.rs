@@ -227,15 +227,10 @@ impl Densifier {
     /// What was matched and confirmed by other views, and what was measured where nothing was: a depth camera is surer of itself, but
     /// matched depth lies exactly where the images have it (kitchen7s_rgbd, live: 24.7 dB so, 23.8 the other way round).
     fn with_measured(&self, matched: Option<DepthMap>, view: &SparseView) -> DepthMap {
-        let Some(measured) = &view.measured else {
-            return matched.unwrap_or_else(DepthMap::none);
-        };
-        let matched = matched.or_else(|| {
-            let (width, height) = self.state.size_of(view.keyframe_id)?;
-            Some(DepthMap::empty(width, height))
-        });
         let mut map = matched.unwrap_or_else(DepthMap::none);
-        fill_measured(&mut map, measured, self.depth_noise);
+        if let Some(measured) = &view.measured {
+            fill_measured(&mut map, measured, self.depth_noise);
+        }
         map
     }
 }

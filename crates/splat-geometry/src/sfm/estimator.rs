@@ -135,11 +135,7 @@ impl Sfm {
                 all_seconds: false,
             }
         } else {
-            Effort {
-                max_features: self.sfm.max_features,
-                n_last: usize::MAX,
-                all_seconds: true,
-            }
+            self.full_effort()
         };
         let link = |scene: &mut Reconstruction, newest, max_error_px, seed| {
             link_last(scene, newest, effort.n_last, max_error_px, seed);
@@ -263,18 +259,21 @@ impl Sfm {
         out
     }
 
+    fn full_effort(&self) -> Effort {
+        Effort {
+            max_features: self.sfm.max_features,
+            n_last: usize::MAX,
+            all_seconds: true,
+        }
+    }
+
     /// Makes views of the keyframes that are new, and links them to those before.
     pub(crate) fn take_in(&mut self, keyframes: &[Arc<Keyframe>]) -> Limits {
         let link = |scene: &mut Reconstruction, newest, max_error_px, seed| {
             link_recent(scene, newest, max_error_px, seed);
             link_older(scene, newest, max_error_px, seed);
         };
-        let effort = Effort {
-            max_features: self.sfm.max_features,
-            n_last: usize::MAX,
-            all_seconds: true,
-        };
-        self.take_in_with(keyframes, effort, link)
+        self.take_in_with(keyframes, self.full_effort(), link)
     }
 
     /// Makes views of the keyframes that are new, and calls `link` with each, the limit of errors and a seed.

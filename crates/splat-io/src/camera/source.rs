@@ -114,14 +114,6 @@ impl Source for CameraSource {
         self.intake.counts()
     }
 
-    fn len_hint(&self) -> Option<u64> {
-        None
-    }
-
-    fn truth_extent(&self) -> Option<f64> {
-        None
-    }
-
     fn is_live(&self) -> bool {
         true
     }

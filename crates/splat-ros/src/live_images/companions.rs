@@ -9,9 +9,9 @@ use splat_io::calibration::{is_rectified, lens_of_camera_info};
 use splat_io::depth_registration::{Calibrated, Registration, registration};
 use splat_io::ground_truth::{Track, Transforms};
 use splat_io::params::SourceParams;
-use splat_io::second_camera::{is_pair, second_from_first};
+use splat_io::second_camera::{OfPair, mounted};
 use splat_io::survey::header_stamp;
-use splat_io::topics::info_beside;
+use splat_io::topics::{info_beside, info_topic_of};
 use splat_msgs::ros::odometry::Odometry;
 use splat_msgs::ros::{self, CameraInfo, CompressedImage, Image, Message, PoseStamped, TfMessage};
 use splat_types::camera::CameraModel;
@@ -197,13 +197,17 @@ impl Beside {
         let received = lock(&self.received);
         let (first, second) = (received.info.as_ref()?, received.second_info.as_ref()?);
         let lens = lens_of_camera_info(second, is_rectified(&topics.images, second)).ok()?;
-        let by_calibration = second_from_first((image_topic, first), (&topics.images, second));
-        let by_transforms = || {
-            let frame = &second.header.frame_id;
-            let mounted = received.transforms.between(frame, camera_frame)?;
-            is_pair(&mounted).then_some(mounted)
+        let first = OfPair {
+            topic: image_topic,
+            frame_id: camera_frame,
+            info: first,
         };
-        Some((lens, by_calibration.or_else(by_transforms)?))
+        let of_second = OfPair {
+            topic: &topics.images,
+            frame_id: &second.header.frame_id,
+            info: second,
+        };
+        Some((lens, mounted(&first, &of_second, &received.transforms)?))
     }
 
     /// The lens by the newest calibration; `None` before the first.
@@ -349,11 +353,7 @@ impl SecondTopics {
         if images.is_empty() {
             return None;
         }
-        let info = if params.second_camera_info_topic.is_empty() {
-            info_beside(&images)
-        } else {
-            params.second_camera_info_topic.clone()
-        };
+        let info = info_topic_of(&params.second_camera_info_topic, &images);
         Some(Self {
             is_compressed: is_compressed(&images),
             within_nanos: (1e9 * params.stereo_tolerance) as u64,

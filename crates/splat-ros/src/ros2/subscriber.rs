@@ -18,7 +18,7 @@ use splat_io::error::SourceError;
 use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
 use splat_io::params::SourceParams;
 use splat_io::queue::Received;
-use splat_io::topics::info_beside;
+use splat_io::topics::info_topic_of;
 use splat_types::frame::Frame;
 use splat_types::time::{Stamp, Stopwatch};
 use splat_types::transform::Rigid;
@@ -58,11 +58,7 @@ impl Ros2Source {
         let link = Link::current().ok_or_else(|| {
             fail("the node is not up; ros2.enabled=off leaves no way to receive ROS 2".to_owned())
         })?;
-        let info_topic = if params.camera_info_topic.is_empty() {
-            info_beside(topic)
-        } else {
-            params.camera_info_topic.clone()
-        };
+        let info_topic = info_topic_of(&params.camera_info_topic, topic);
         let beside = Beside::new(params, &info_topic, &link.setup.odom_frame);
         subscribe(&beside, &link).map_err(|e| fail(e.to_string()))?;
         let mut source = Self {
@@ -260,13 +256,5 @@ impl Source for Ros2Source {
     fn counts(&self) -> SourceCounts {
         let dropped = self.subscription.as_ref().map_or(0, |s| s.images.dropped());
         self.assembler.counts(dropped)
-    }
-
-    fn len_hint(&self) -> Option<u64> {
-        None
-    }
-
-    fn truth_extent(&self) -> Option<f64> {
-        None
     }
 }

@@ -18,7 +18,7 @@ use splat_io::error::SourceError;
 use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
 use splat_io::params::SourceParams;
 use splat_io::queue::{Received, Receiver, Sender, WhenFull, queue};
-use splat_io::topics::info_beside;
+use splat_io::topics::info_topic_of;
 use splat_msgs::ros::{CompressedImage, Image, Message as _};
 use splat_types::frame::Frame;
 use splat_types::time::{Stamp, Stopwatch};
@@ -26,7 +26,7 @@ use splat_types::transform::Rigid;
 
 /// Images between zenoh's threads and the source's: a burst passes, and none is old when it is decoded.
 const MAX_IMAGES: usize = 4;
-/// How long images wait for a calibration, and for what goes with each: as the defaults of `ros2.*`.
+/// How long images wait for a calibration, and for what goes with each: for that as long as `ros2.odometry_timeout` by default.
 const PATIENCE: Patience = Patience {
     camera_info_secs: 3.0,
     companions_secs: 0.1,
@@ -77,11 +77,7 @@ impl ZenohSource {
             let reason = "a topic is wanted, such as zenoh:/camera/image_raw";
             return Err(fail(reason.to_owned()));
         }
-        let info_topic = if params.camera_info_topic.is_empty() {
-            info_beside(topic)
-        } else {
-            params.camera_info_topic.clone()
-        };
+        let info_topic = info_topic_of(&params.camera_info_topic, topic);
         // The publisher has a session of its own, which listens.
         let publish = PublishParams {
             zenoh_listen: String::new(),
@@ -245,14 +241,6 @@ impl Source for ZenohSource {
 
     fn counts(&self) -> SourceCounts {
         self.assembler.counts(self.images.dropped())
-    }
-
-    fn len_hint(&self) -> Option<u64> {
-        None
-    }
-
-    fn truth_extent(&self) -> Option<f64> {
-        None
     }
 
     fn is_live(&self) -> bool {
