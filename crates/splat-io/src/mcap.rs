@@ -98,6 +98,15 @@ impl DepthTopic {
     }
 }
 
+/// Messages that were read and not used yet, by what they hold.
+#[derive(Debug, Default)]
+struct Queues {
+    images: VecDeque<Waiting>,
+    depths: VecDeque<Waiting>,
+    /// Of the second camera.
+    seconds: VecDeque<Waiting>,
+}
+
 #[derive(Debug)]
 pub struct McapSource {
     bag: Bag,
@@ -107,10 +116,7 @@ pub struct McapSource {
     truth_within_nanos: i64,
     n_images: u64,
     max_frames: u64,
-    images: VecDeque<Waiting>,
-    depths: VecDeque<Waiting>,
-    /// Of the second camera.
-    seconds: VecDeque<Waiting>,
+    queues: Queues,
     is_read: bool,
     jpeg: Jpeg,
     intake: Intake,
@@ -174,9 +180,7 @@ impl McapSource {
                 second,
             },
             max_frames: params.max_frames,
-            images: VecDeque::new(),
-            depths: VecDeque::new(),
-            seconds: VecDeque::new(),
+            queues: Queues::default(),
             is_read: false,
             jpeg: Jpeg::default(),
             intake: Intake::new(params, lens),
@@ -205,9 +209,9 @@ impl McapSource {
             .as_ref()
             .is_some_and(|s| s.name == *topic);
         let waiting = match topic {
-            name if *name == self.topics.image => &mut self.images,
-            _ if is_depth => &mut self.depths,
-            _ if is_second => &mut self.seconds,
+            name if *name == self.topics.image => &mut self.queues.images,
+            _ if is_depth => &mut self.queues.depths,
+            _ if is_second => &mut self.queues.seconds,
             _ => return,
         };
         let stamp = header_stamp(message.payload, message.log_nanos);
@@ -215,7 +219,7 @@ impl McapSource {
             stamp,
             payload: message.payload.to_vec(),
         });
-        for beside in [&mut self.depths, &mut self.seconds] {
+        for beside in [&mut self.queues.depths, &mut self.queues.seconds] {
             while beside.len() > MAX_AHEAD
                 || (beside.len() > 1 && bytes_of(beside) > MAX_AHEAD_BYTES)
             {
@@ -226,17 +230,18 @@ impl McapSource {
 
     /// The oldest image, once what goes with it is here or will not come.
     fn take_ready(&mut self) -> Option<Waiting> {
-        let stamp = self.images.front()?.stamp;
+        let queues = &mut self.queues;
+        let stamp = queues.images.front()?.stamp;
         let newest = |beside: &VecDeque<Waiting>| beside.iter().filter_map(|w| w.stamp).max();
-        let has_depth = self.topics.depth.is_none() || newest(&self.depths) >= stamp;
-        let has_second = self.topics.second.is_none() || newest(&self.seconds) >= stamp;
+        let has_depth = self.topics.depth.is_none() || newest(&queues.depths) >= stamp;
+        let has_second = self.topics.second.is_none() || newest(&queues.seconds) >= stamp;
         let is_ready = self.is_read
             || stamp.is_none()
             || (has_depth && has_second)
-            || self.images.len() > MAX_AHEAD
-            || bytes_of(&self.images) > MAX_AHEAD_BYTES;
+            || queues.images.len() > MAX_AHEAD
+            || bytes_of(&queues.images) > MAX_AHEAD_BYTES;
         if is_ready {
-            self.images.pop_front()
+            queues.images.pop_front()
         } else {
             None
         }
@@ -286,7 +291,7 @@ impl McapSource {
     /// The depth map that is nearest in time, if it is near enough. Images without one are counted.
     fn depth_at(&mut self, stamp: Stamp) -> Option<DepthMap> {
         let topic = self.topics.depth.as_mut()?;
-        let nearest = nearest(&self.depths, stamp, topic.within_nanos);
+        let nearest = nearest(&self.queues.depths, stamp, topic.within_nanos);
         let decoded = nearest.map(|depth| {
             let depth = depth_of(&depth.payload, topic.is_compressed)?;
             topic.registration.apply(depth)
@@ -306,7 +311,7 @@ impl McapSource {
     /// What the second camera saw at the same time. Images without it are counted.
     fn second_at(&mut self, stamp: Stamp) -> Option<SecondImage> {
         let topic = self.topics.second.as_ref()?;
-        let nearest = nearest(&self.seconds, stamp, topic.within_nanos);
+        let nearest = nearest(&self.queues.seconds, stamp, topic.within_nanos);
         let second = nearest.map(|second| topic.camera.image(stamp, second.payload.clone()));
         if second.is_none() {
             self.intake.without_second();
