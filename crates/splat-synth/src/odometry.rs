@@ -16,8 +16,12 @@ pub(crate) fn base_from_cam() -> Rigid {
     Rigid::new(DQuat::from_mat3(&looks_forward), DVec3::new(0.25, 0.0, 0.6))
 }
 
-/// `odom_from_base` at every frame; the length of each step and its turn are off by `noise` (a normal share). Starts at the
-/// identity.
+/// Wheels slip for so many seconds, from that share of the take on.
+const SLIP_SECS: f64 = 2.0;
+const SLIPS_FROM: f64 = 1.0 / 3.0;
+
+/// `odom_from_base` at every frame; the length of each step and its turn are off by `noise` (a normal share), and the length by
+/// that of wheels that slip. Starts at the identity.
 pub(crate) fn track(take: &Take, noise: f64) -> Vec<Rigid> {
     let mut random = Pcg32::seed_from_u64(take.settings().seed ^ STREAM);
     let cam_from_base = base_from_cam().inverse();
@@ -28,9 +32,21 @@ pub(crate) fn track(take: &Take, noise: f64) -> Vec<Rigid> {
         let step = world_from_base(ix - 1).inverse() * world_from_base(ix);
         let mut share = || 1.0 + noise * f64::from(gaussian(&mut random));
         let turn = step.rotation.to_scaled_axis() * share();
-        let noisy = Rigid::new(DQuat::from_scaled_axis(turn), step.translation * share());
+        let length = share() * (1.0 + slip(take, ix));
+        let noisy = Rigid::new(DQuat::from_scaled_axis(turn), step.translation * length);
         odom_from_base = (odom_from_base * noisy).renormalized();
         track.push(odom_from_base);
     }
     track
+}
+
+/// By what share the step to a frame is too long.
+fn slip(take: &Take, ix: u32) -> f64 {
+    let at = |ix: u32| take.stamp(ix).secs_since(take.stamp(0));
+    let from = SLIPS_FROM * at(take.settings().n_frames);
+    if (from..from + SLIP_SECS).contains(&at(ix)) {
+        take.settings().slip
+    } else {
+        0.0
+    }
 }

@@ -46,6 +46,9 @@ impl SynthSettings {
                 "rate" => self.rate = Some(number),
                 "speed" => self.speed = number,
                 "odometry" => self.odometry = Some(number),
+                "slip" => self.slip = number,
+                "blackout" => self.blackout = number,
+                "shake" => self.shake = number,
                 _ => self.jpeg_quality = number as u8,
             }
             return Ok(());
@@ -93,6 +96,9 @@ impl SynthSettings {
                 "rate" => self.rate.unwrap_or(RATE),
                 "speed" => self.speed,
                 "odometry" => self.odometry.unwrap_or(0.0),
+                "slip" => self.slip,
+                "blackout" => self.blackout,
+                "shake" => self.shake,
                 _ => f64::from(self.jpeg_quality),
             };
             if !range.allows(value) {
@@ -147,7 +153,7 @@ impl Range {
     }
 }
 
-const RANGES: [Range; 12] = [
+const RANGES: [Range; 15] = [
     Range::new(
         "frames",
         [1.0, 100_000.0],
@@ -172,6 +178,9 @@ const RANGES: [Range; 12] = [
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
     Range::new("movers", [0.0, 100.0], true, "a whole number in [0, 100]"),
     Range::new("odometry", [0.0, 1.0], false, "a share in [0, 1]"),
+    Range::new("slip", [-1.0, 1.0], false, "a share in [-1, 1]"),
+    Range::new("blackout", [0.0, 600.0], false, "seconds in [0, 600]"),
+    Range::new("shake", [0.0, 20.0], false, "a number in [0, 20]"),
     Range::new("rate", RATES, false, "frames per second in [1, 1000]"),
     Range::new("speed", [0.0, 100.0], false, "a number in [0, 100]"),
     Range::new("quality", [1.0, 100.0], true, "a whole number in [1, 100]"),

@@ -88,7 +88,7 @@ impl Take {
     fn pose_beside(&self, ix: u32, share: f64) -> Rigid {
         let secs = self.tenths(f64::from(ix) + share) * 1e8 * 1e-9 * self.settings.speed;
         let hand = noise::hash((self.settings.seed ^ (self.settings.seed >> 32)) as u32);
-        trajectory::gt_from_cam(self.settings.scene, secs, hand)
+        trajectory::gt_from_cam(self.settings.scene, secs, (hand, self.settings.shake))
     }
 
     pub fn image(&self, ix: u32) -> RgbImage {
@@ -98,7 +98,7 @@ impl Take {
             self.settings.height_px as usize,
         );
         let samples = self.samples(ix);
-        let gain = self.gain(ix);
+        let (gain, is_dark) = (self.gain(ix), self.is_dark(ix));
         let (at, n) = ((self.pose(ix), ix), self.settings.movers);
         let movers = movers::movers(&self.scene, &lens, at, (n, self.settings.seed));
         let mut pixels = vec![0u8; 3 * width * height];
@@ -112,7 +112,11 @@ impl Take {
                         ^ y as u64,
                 );
                 for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                    let light = self.pixel_light(&lens, &samples, &movers, [x, y]);
+                    let light = if is_dark {
+                        Vec3::ZERO
+                    } else {
+                        self.pixel_light(&lens, &samples, &movers, [x, y])
+                    };
                     *pixel = expose(light * gain, self.settings.noise as f32, &mut random);
                 }
             });
@@ -219,6 +223,13 @@ impl Take {
             sum += self.scene.radiance(&ray, pixel_angle).min(Vec3::splat(4.0));
         }
         sum / samples.len() as f32
+    }
+
+    /// Whether the camera sees nothing.
+    fn is_dark(&self, ix: u32) -> bool {
+        let middle = 0.5 * f64::from(self.settings.n_frames);
+        let off = (f64::from(ix) - middle) / self.rate();
+        2.0 * off.abs() < self.settings.blackout
     }
 
     /// Slow wave of the automatic exposure; one period in about eight seconds.

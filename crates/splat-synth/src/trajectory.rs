@@ -12,7 +12,8 @@ use splat_types::transform::Rigid;
 /// One round takes this long at speed 1; then it goes on, closed and smooth.
 pub(crate) const LAP_SECS: f64 = 12.0;
 
-pub(crate) fn gt_from_cam(scene: SceneKind, secs: f64, seed: u32) -> Rigid {
+/// `hand`: its seed, and how much more than usual it trembles.
+pub(crate) fn gt_from_cam(scene: SceneKind, secs: f64, hand: (u32, f64)) -> Rigid {
     let turn = TAU * secs / LAP_SECS;
     let (position, target) = match scene {
         SceneKind::Room => around_the_table(turn),
@@ -21,10 +22,12 @@ pub(crate) fn gt_from_cam(scene: SceneKind, secs: f64, seed: u32) -> Rigid {
         SceneKind::Hallway => along_the_hallway(secs),
         SceneKind::House => through_both_rooms(turn),
     };
-    let rotation = looking(target - position) * DQuat::from_scaled_axis(shake(secs, seed, 0.008));
+    let (seed, shaken) = hand;
+    let trembling = shake(secs, seed, 0.008 * shaken);
+    let rotation = looking(target - position) * DQuat::from_scaled_axis(trembling);
     Rigid::new(
         rotation,
-        position + shake(secs, seed ^ 0x51ED, 0.012) + step_bob(secs),
+        position + shake(secs, seed ^ 0x51ED, 0.012 * shaken) + step_bob(secs),
     )
 }
 
