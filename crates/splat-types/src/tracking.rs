@@ -8,7 +8,7 @@ use crate::transform::Rigid;
 pub enum TrackState {
     /// No frame has had a pose.
     Initialising,
-    /// The pose is measured, or carried on for less than `track.lost_secs`.
+    /// The pose is measured, carried on for less than `track.lost_secs`, or by odometry of the source for as long as that is sure.
     Tracking,
     /// No pose was found for `track.lost_secs`.
     Lost,
@@ -49,7 +49,7 @@ pub struct TrackedPose {
     pub world_from_cam: Rigid,
     /// Of the camera in its own axes: translation (the map's unit), then turn (rad).
     pub covariance: Covariance,
-    /// Not measured on this frame: the motion before it carried on, with a covariance that grows.
+    /// Not measured on this frame: the motion before it carried on, or odometry did, with a covariance that grows.
     pub is_predicted: bool,
 }
 

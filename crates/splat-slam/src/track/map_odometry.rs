@@ -3,6 +3,7 @@
 use crate::track::align::AlignmentFrame;
 use crate::track::landmarks::KeyframeView;
 use crate::track::odometry_link::{LinkedKeyframe, LinkedMotion, LinkedPose, OdometryLink};
+use crate::track::wheel_odometry::WheelOdometry;
 use crate::visual_odometry::odometry::{OdometryPose, VisualOdometry};
 use crate::working_camera::WorkingCamera;
 use splat_types::camera::Intrinsics;
@@ -41,6 +42,8 @@ pub(crate) struct MapOdometry {
     /// `None`: frames are found by the map alone.
     odometry: Option<VisualOdometry>,
     link: OdometryLink,
+    /// Odometry that the source has, such as that of wheels.
+    wheels: WheelOdometry,
     camera: Option<FrameCamera>,
     before_map: BeforeMap,
 }
@@ -50,6 +53,7 @@ impl MapOdometry {
         Self {
             odometry: is_on.then(VisualOdometry::default),
             link: OdometryLink::default(),
+            wheels: WheelOdometry::default(),
             camera: None,
             before_map: BeforeMap::Waiting,
         }
@@ -73,6 +77,7 @@ impl MapOdometry {
 
     /// Odometry of one more frame.
     pub(crate) fn follow(&mut self, frame: &Frame) -> Option<OdometryPose> {
+        self.wheels.push(frame);
         let odometry = self.odometry.as_mut()?;
         let size = (frame.image.width_px, frame.image.height_px);
         let is_same = |known: &FrameCamera| {
@@ -97,9 +102,20 @@ impl MapOdometry {
         self.link.motion(earlier, later)
     }
 
+    /// Where a frame is by a keyframe and the source's odometry since.
+    pub(crate) fn locate_by_wheels(&self, seq: u64) -> Option<LinkedPose> {
+        self.wheels.link.locate(seq)
+    }
+
+    /// How the camera has moved between two frames by the source's odometry.
+    pub(crate) fn motion_by_wheels(&self, earlier: u64, later: u64) -> Option<LinkedMotion> {
+        self.wheels.link.motion(earlier, later)
+    }
+
     /// The pose of a frame that the map has reached in the keyframe before it, by the keyframes on both sides.
     pub(crate) fn between_keyframes(&self, seq: u64) -> Option<(u32, Rigid)> {
-        self.link.between_keyframes(seq)
+        let by_images = self.link.between_keyframes(seq);
+        by_images.or_else(|| self.wheels.link.between_keyframes(seq))
     }
 
     /// Whether a pose is to be reported in odometry's frame, as there is no map: the first segment's.
@@ -128,12 +144,15 @@ impl MapOdometry {
 
     /// Takes over where the map has its keyframes now, in order of id.
     pub(crate) fn update(&mut self, views: &[KeyframeView]) -> Option<MapInitialisation> {
-        let linked = views.iter().map(|view| LinkedKeyframe {
-            id: view.keyframe.id,
-            seq: view.keyframe.frame.seq,
-            world_from_cam: view.world_from_cam,
-        });
-        let newest = self.link.update(linked);
+        let linked = || {
+            views.iter().map(|view| LinkedKeyframe {
+                id: view.keyframe.id,
+                seq: view.keyframe.frame.seq,
+                world_from_cam: view.world_from_cam,
+            })
+        };
+        let newest = self.link.update(linked());
+        self.wheels.link.update(linked());
         if let Some(view) = views.last() {
             self.camera = FrameCamera::of(view);
             if self.before_map == BeforeMap::Waiting {

@@ -26,6 +26,8 @@ mod anchor;
 
 mod odometry_link;
 
+mod wheel_odometry;
+
 mod map_odometry;
 
 pub mod refinement;

@@ -21,7 +21,7 @@ use crate::track::map_odometry::MapOdometry;
 use crate::track::map_points::MapPoints;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
-use crate::track::odometry_link::LinkedPose;
+use crate::track::odometry_link::{LinkedMotion, LinkedPose};
 use crate::track::params::TrackParams;
 use crate::track::refinement::FrameRef;
 use splat_types::covariance::Covariance;
@@ -173,7 +173,12 @@ impl Tracker {
     fn look_at(&mut self, frame: &Frame) -> TrackedFrame {
         let odometry = self.odometry.follow(frame);
         let linked = self.linked(frame.seq);
-        if let Some(found) = self.found_by_points(frame, linked.as_ref()) {
+        let wheels = match linked {
+            Some(_) => None,
+            None => self.linked_by_wheels(frame.seq),
+        };
+        let near = linked.as_ref().or(wheels.as_ref());
+        if let Some(found) = self.found_by_points(frame, near, linked.is_none()) {
             let tracked = self.found((frame.seq, frame.stamp), &found);
             self.keep(None, &tracked, None);
             return tracked;
@@ -188,7 +193,8 @@ impl Tracker {
         self.search.last = Some(frame.stamp);
         let seen = Arc::new(Observation::of(frame, &self.params));
         let at = (seen.seq, seen.stamp);
-        let guess = linked.as_ref().map(|(_, pose)| pose.inverse());
+        let guess = linked.as_ref().or(wheels.as_ref());
+        let guess = guess.map(|(_, pose)| pose.inverse());
         let tracked = match (self.found_by_corners(&seen, guess), linked) {
             (Ok(found), Some((linked, pose)))
                 if found.points.is_none() && self.is_surer(&linked, &found.located) =>
@@ -198,9 +204,13 @@ impl Tracker {
             (Ok(found), _) => self.found(at, &found),
             (Err(_), Some((linked, pose))) => self.carried(at, &linked, &pose),
             (Err(reason), None) => {
-                match odometry.filter(|pose| self.odometry.reports_before_map(pose)) {
-                    Some(pose) => return self.ahead_of_map(seen, &pose),
-                    None => self.missed(at, reason),
+                let before_map = odometry.filter(|pose| self.odometry.reports_before_map(pose));
+                match (before_map, wheels) {
+                    (Some(pose), _) => return self.ahead_of_map(seen, &pose),
+                    (None, Some((linked, pose))) => {
+                        return self.bridged(seen, reason, &linked, &pose);
+                    }
+                    (None, None) => self.missed(at, reason),
                 }
             }
         };
@@ -371,15 +381,33 @@ impl Tracker {
     /// A frame where odometry says, among the keyframes as they stand now: from the last frame that was found by landmarks or from
     /// the newest keyframe, whichever leaves the place more certain.
     fn linked(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
+        self.surest(self.odometry.locate(seq), |found| {
+            self.odometry.motion(found, seq)
+        })
+    }
+
+    /// The same by the odometry that the source has.
+    fn linked_by_wheels(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
+        self.surest(self.odometry.locate_by_wheels(seq), |found| {
+            self.odometry.motion_by_wheels(found, seq)
+        })
+    }
+
+    /// A frame by where it is to a keyframe, or by the motion since the last frame that was found by landmarks.
+    fn surest(
+        &self,
+        of_key: Option<LinkedPose>,
+        since: impl Fn(u64) -> Option<LinkedMotion>,
+    ) -> Option<(LinkedPose, Rigid)> {
         let by_key = || {
-            let mut linked = self.odometry.locate(seq)?;
+            let mut linked = of_key?;
             linked.covariance += self.localizer().covariance_of_key(&linked);
             let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
             Some((linked, *world_from_key * linked.key_from_cam))
         };
         let by_frame = || {
             let found = self.search.found.as_ref()?;
-            let motion = self.odometry.motion(found.seq, seq)?;
+            let motion = since(found.seq)?;
             let world_from_cam = self.pose_by(&found.anchor)? * motion.earlier_from_later;
             let (world_from_key, _) = self.keyframes.get(&found.anchor.keyframe_id)?;
             let of_found = transported(&found.covariance, &motion.earlier_from_later.inverse());
@@ -420,20 +448,25 @@ impl Tracker {
             })
         } else if let Some(seen) = &waiting.seen {
             let guess = frame.anchor.and_then(|anchor| self.pose_by(&anchor));
-            self.localizer()
-                .find_again(seen, guess)
-                .map(|located| self.anchor_of(&located))
+            let found = self.localizer().find_again(seen, guess);
+            let by_landmarks = found.map(|located| self.anchor_of(&located));
+            by_landmarks.or_else(|| self.anchor_between(waiting.seq))
         } else {
-            let between = self.odometry.between_keyframes(waiting.seq);
-            between.map(|(keyframe_id, key_from_cam)| Anchor {
-                keyframe_id,
-                key_from_cam,
-                unit: self.keyframes.get(&keyframe_id).map_or(1.0, |k| k.1),
-            })
+            self.anchor_between(waiting.seq)
         };
         if let Some(anchor) = anchor {
             self.history.frames[waiting.history_ix].anchor = Some(anchor);
         }
+    }
+
+    /// By the keyframes on both sides of a frame and odometry.
+    fn anchor_between(&self, seq: u64) -> Option<Anchor> {
+        let (keyframe_id, key_from_cam) = self.odometry.between_keyframes(seq)?;
+        Some(Anchor {
+            keyframe_id,
+            key_from_cam,
+            unit: self.keyframes.get(&keyframe_id).map_or(1.0, |k| k.1),
+        })
     }
 
     fn localizer(&self) -> Localizer<'_> {

@@ -39,11 +39,13 @@ impl FoundPose {
 }
 
 impl Tracker {
-    /// By triangulated points, where odometry or the motion so far leads; where odometry does not know, beside the newest keyframes.
+    /// By triangulated points, where odometry or the motion so far leads; where visual odometry does not know, beside the newest
+    /// keyframes.
     pub(super) fn found_by_points(
         &self,
         frame: &Frame,
         linked: Option<&(LinkedPose, Rigid)>,
+        is_searched: bool,
     ) -> Option<FoundPose> {
         let guess = linked.map(|(_, pose)| pose.inverse());
         let ahead = || {
@@ -54,9 +56,7 @@ impl Tracker {
         let near = guess.or_else(ahead).and_then(|guess| self.aligned(&guess));
         match near {
             Some(aligned) => Some(FoundPose::aligned(aligned, false)),
-            None if guess.is_none() => {
-                Some(FoundPose::aligned(self.aligned_by_search(frame)?, true))
-            }
+            None if is_searched => Some(FoundPose::aligned(self.aligned_by_search(frame)?, true)),
             None => None,
         }
     }

@@ -15,6 +15,11 @@ use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
 use splat_types::transform::Rigid;
 
+/// A pose that odometry has carried on is no pose beyond a standard deviation of such a share of the scene's depth, and of so many
+/// radians.
+const MAX_BRIDGED_STD: f64 = 0.25;
+const MAX_BRIDGED_TURN_STD: f64 = 0.2;
+
 impl Tracker {
     pub(super) fn found(&mut self, (seq, stamp): (u64, Stamp), found: &FoundPose) -> TrackedFrame {
         let located = &found.located;
@@ -95,6 +100,49 @@ impl Tracker {
             linked.n_inliers,
         );
         self.measured(frame, pose, anchor, is_new)
+    }
+
+    /// The image shows nothing that could be found, but odometry of the source has gone on. As long as it is sure enough, nothing is
+    /// lost.
+    pub(super) fn bridged(
+        &mut self,
+        seen: Arc<Observation>,
+        reason: LostReason,
+        linked: &LinkedPose,
+        world_from_cam: &Rigid,
+    ) -> TrackedFrame {
+        let worst = |axes: std::ops::Range<usize>| {
+            let variances = axes.map(|i| linked.covariance[(i, i)]);
+            variances.fold(0.0, f64::max).sqrt()
+        };
+        let is_sure = worst(0..3) < MAX_BRIDGED_STD * self.scene_depth()
+            && worst(3..6) < MAX_BRIDGED_TURN_STD;
+        if !is_sure || matches!(self.state, TrackState::Initialising | TrackState::Lost) {
+            let tracked = self.missed((seen.seq, seen.stamp), reason);
+            self.keep(Some(seen), &tracked, None);
+            return tracked;
+        }
+        self.search.n_failed += 1;
+        self.state = TrackState::Tracking;
+        let tracked = TrackedFrame {
+            seq: seen.seq,
+            stamp: seen.stamp,
+            state: self.state,
+            reason: Some(reason),
+            pose: Some(TrackedPose {
+                world_from_cam: *world_from_cam,
+                covariance: rows(&linked.covariance),
+                is_predicted: true,
+            }),
+            n_inliers: 0,
+        };
+        self.keep(Some(seen), &tracked, None);
+        let unit = self.keyframes.get(&linked.keyframe_id);
+        let anchor = linked.anchor(unit.map_or(1.0, |(_, unit)| *unit));
+        if let Some(entry) = self.history.frames.last_mut() {
+            entry.anchor = Some(anchor);
+        }
+        tracked
     }
 
     /// A pose in the map: `cam_from_world`, its covariance and the observations that agree. `is_new`: it owes nothing to where
