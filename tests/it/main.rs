@@ -46,6 +46,7 @@ mod metric_scale;
 mod mvs;
 mod node_over_zenoh;
 mod obstacles;
+mod odometry;
 mod old_names;
 mod onnx;
 mod onnx_models;

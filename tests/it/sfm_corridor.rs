@@ -15,7 +15,7 @@ const SCENE: &str = "synthetic:endless?frames=400&rate=30&width=320&height=240";
 const EVERY: usize = 4;
 
 /// Poses of the keyframes of each submap at the end.
-fn submaps(keyframes: &[Arc<Keyframe>]) -> BTreeMap<u32, BTreeMap<u32, Rigid>> {
+pub(crate) fn submaps(keyframes: &[Arc<Keyframe>]) -> BTreeMap<u32, BTreeMap<u32, Rigid>> {
     let params = Settings::shipped().params().unwrap();
     let mut model = Sfm::new(&params.sfm, &params.mvs, 1).unwrap();
     let mut found = BTreeMap::new();
@@ -43,7 +43,7 @@ fn submaps(keyframes: &[Arc<Keyframe>]) -> BTreeMap<u32, BTreeMap<u32, Rigid>> {
 }
 
 /// RMSE after the best similarity, as a share of the way's extent; of (true, found).
-fn position_error(pairs: &[(Rigid, Rigid)]) -> f64 {
+pub(crate) fn position_error(pairs: &[(Rigid, Rigid)]) -> f64 {
     let places: Vec<_> = pairs
         .iter()
         .map(|(t, o)| (t.translation, o.translation))

@@ -9,6 +9,8 @@ pub mod pnp;
 
 pub mod similarity;
 
+pub mod length_ratio;
+
 pub mod stats;
 
 pub mod shared_library;

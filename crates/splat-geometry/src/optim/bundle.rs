@@ -7,6 +7,8 @@ mod reduced;
 
 pub mod problem;
 
+mod relative_motion;
+
 mod linear;
 
 use glam::DVec3;
@@ -54,6 +56,7 @@ fn split<'a>(problem: &'a mut Problem, settings: &Settings) -> (Flat<'a>, State)
     let flat = Flat {
         observations: &problem.observations,
         ends: &problem.ends,
+        motions: &problem.motions,
         start: state.cameras.clone(),
         loss_px: settings.loss_px,
         moves: [settings.refine_focal, settings.refine_radial].map(|asked| asked && is_shared),
@@ -68,7 +71,13 @@ fn layout(flat: &Flat<'_>) -> Layout {
     let points = starts
         .zip(flat.ends)
         .map(|(start, end)| &cameras[start..*end]);
-    Layout::new(&is_held, points)
+    let pairs: Vec<[u32; 2]> = flat
+        .motions
+        .iter()
+        .map(|motion| [motion.first_ix, motion.second_ix])
+        .collect();
+    let tied = pairs.iter().map(|pair| &pair[..]);
+    Layout::new(&is_held, points.chain(tied))
 }
 
 /// Bundle adjustment as a problem of least squares.
@@ -197,7 +206,8 @@ fn total_cost(state: &State, flat: &Flat<'_>) -> f64 {
                     times(&hold, &off).iter().zip(off).map(|(a, b)| a * b).sum()
                 })
         });
-    costs.iter().sum::<f64>() / scale + holds.sum::<f64>()
+    let motions = relative_motion::cost(&state.cameras, flat);
+    (costs.iter().sum::<f64>() + motions) / scale + holds.sum::<f64>()
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ use crate::optim::pose_covariance::pose_information;
 use crate::sfm::landmarks::filter;
 use crate::sfm::limits::Limits;
 use crate::sfm::metric_submap::make_metric;
+use crate::sfm::odometry::motions;
 use crate::sfm::params::LocalBaPrior;
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 use crate::stats::median;
@@ -266,6 +267,11 @@ fn problem(
             });
         }
         problem.add_point(landmark.point, seen);
+    }
+    let submap = moves.free.first().and_then(|ix| scene.submap_of(*ix));
+    if let Some(submap) = submap {
+        let camera = |view: usize| camera_of.get(&(view as u32)).copied();
+        problem.motions = motions(scene, submap, camera);
     }
     (problem, views)
 }

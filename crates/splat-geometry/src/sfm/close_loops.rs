@@ -13,7 +13,9 @@ use crate::optim::pose_graph::edge::Edge;
 use crate::sfm::adjust::{adjust_global, adjust_local};
 use crate::sfm::landmarks::{extend, join};
 use crate::sfm::limits::Limits;
-use crate::sfm::merge_submaps::similarity;
+use crate::sfm::merge_submaps::{similarity, views_in_common};
+use crate::sfm::odometry::std_between;
+use crate::sfm::overlap::overlap;
 use crate::sfm::pairwise::{pair_seed, release};
 use crate::sfm::reconstruction::{
     Landmark, NONE, PairMatches, Reconstruction, RegisteredView, SfmView, Submap,
@@ -84,6 +86,7 @@ pub(crate) fn settle(scene: &mut Reconstruction, limits: &Limits, max_drift: Opt
             .filter(plausible)
             .max_by_key(|c| (c.pairs.len(), c.ends));
         let links = best.and_then(|best| find_inliers(scene, &found, best));
+        let links = links.filter(|all| is_one_place(scene, all, limits));
         is_closed = links.is_some_and(|all| close(scene, &all, limits));
     }
     let newest = scene.views.len();
@@ -167,6 +170,20 @@ fn find_inliers<'a>(
     (is_enough && is_clear).then_some(all)
 }
 
+/// Whether what is round the landmarks in common is the same as well.
+fn is_one_place(scene: &Reconstruction, links: &[&Candidate], limits: &Limits) -> bool {
+    let Some(first) = links.first() else {
+        return false;
+    };
+    let views = views_in_common(
+        scene,
+        links.iter().flat_map(|link| link.pairs.iter().copied()),
+    );
+    let overlap = overlap(scene, &views, &first.correction, limits.max_error_px);
+    tracing::debug!(?overlap, "a place that is seen again");
+    overlap.is_one_place()
+}
+
 fn depth(scene: &Reconstruction, view: usize) -> f64 {
     median(&mut scene.depths(view)).unwrap_or(1.0)
 }
@@ -241,6 +258,13 @@ fn bend(scene: &mut Reconstruction, submap: u32, links: &[&Candidate]) -> bool {
     let depths: Vec<f64> = views.iter().map(|s| depth(scene, *s)).collect();
     let way: Vec<usize> = (0..views.len()).collect();
     let mut edges = Edge::along(&way, &before, |ix| depths[ix]);
+    for edge in &mut edges {
+        loosen(
+            scene,
+            edge,
+            (submap, [views[edge.first], views[edge.second]]),
+        );
+    }
     let ix = |(a, b): (usize, usize)| Some((*ix_of.get(&a)?, *ix_of.get(&b)?));
     let closed = scene.closed.iter().filter_map(|ends| ix(*ends));
     edges.extend(closed.map(|ends| Edge::as_is(&before, ends, depths[ends.1])));
@@ -278,6 +302,18 @@ fn bend(scene: &mut Reconstruction, submap: u32, links: &[&Candidate]) -> bool {
         }
     }
     true
+}
+
+/// Where odometry alone ties two views, the edge between them is as stiff as odometry is sure.
+fn loosen(scene: &Reconstruction, edge: &mut Edge, (submap, ends): (u32, [usize; 2])) {
+    let has_odometry = scene.views[ends[0]].keyframe.frame.odometry.is_some();
+    if !has_odometry || scene.shared_counts(ends[0]).contains_key(&ends[1]) {
+        return;
+    }
+    if let Some([place, turn]) = std_between(scene, submap, ends[0], ends[1]) {
+        edge.std[0] = edge.std[0].max(place);
+        edge.std[1] = edge.std[1].max(turn);
+    }
 }
 
 struct KeptView {

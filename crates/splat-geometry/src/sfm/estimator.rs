@@ -18,12 +18,13 @@ use crate::sfm::dense_depth::{Densifier, NextDepth};
 use crate::sfm::finder::{Finder, Found};
 use crate::sfm::global_adjustment::{AdjustedSubmap, GlobalAdjustment};
 use crate::sfm::initialize::{Start, start};
+use crate::sfm::join_submaps::join_by_odometry;
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::merge;
 use crate::sfm::metric_submap::metric_unit;
 use crate::sfm::pairwise::{link_alike, link_anew, link_last, link_older, link_recent};
 use crate::sfm::params::SfmParams;
-use crate::sfm::reconstruction::{NONE, Reconstruction, SfmView, Submap};
+use crate::sfm::reconstruction::{NONE, OdometryNoise, Reconstruction, SfmView, Submap};
 use crate::sfm::register::{grow, grow_at_once, release_clearer};
 use crate::sfm::undistorted_views::{links_are_stale, undistort_images};
 use crate::sfm::updates::{self, Reported, SparseBatch, note};
@@ -96,7 +97,10 @@ impl Sfm {
             finder: Finder::new(sfm)?,
             densifier: Densifier::new(mvs, sfm.depth_noise)?,
             seed,
-            scene: Reconstruction::default(),
+            scene: Reconstruction {
+                odometry_noise: OdometryNoise::new(sfm),
+                ..Reconstruction::default()
+            },
             reported: Reported::default(),
             batch_id: 0,
             last_start: None,
@@ -439,7 +443,7 @@ impl Sfm {
         }
         let max_loop_correction = self.sfm.loops.then_some(self.sfm.max_loop_correction);
         self.is_loop |= settle(&mut self.scene, limits, max_loop_correction);
-        while merge(&mut self.scene, limits) {
+        while merge(&mut self.scene, limits) || join_by_odometry(&mut self.scene, limits) {
             grow(&mut self.scene, pool, limits);
         }
     }

@@ -10,6 +10,7 @@ use crate::ransac::{self, Tries};
 use crate::sfm::adjust::adjust_global;
 use crate::sfm::landmarks::join;
 use crate::sfm::limits::Limits;
+use crate::sfm::overlap::overlap;
 use crate::sfm::pairwise::pair_seed;
 use crate::sfm::reconstruction::{NONE, Reconstruction};
 use crate::similarity;
@@ -19,6 +20,8 @@ const TRIES: usize = 300;
 /// Share of the landmarks in common: two parts of one room measured 0.56 to 0.86 (kitchen7s, 16 joins and loops). Where the
 /// parts are of few keyframes a fourth of them agrees on a wrong place, too.
 const MIN_INLIERS: f64 = 0.5;
+/// Pairs of views that are compared before two submaps are one.
+const N_COMPARED: usize = 6;
 
 /// Merges the submaps that fit, of those that have come to share matches since the last call; again, until it answers
 /// `false`. The submap with the lower number stays.
@@ -72,18 +75,19 @@ fn merge_pair(scene: &mut Reconstruction, stays: u32, gone: u32, limits: &Limits
     ) else {
         return false;
     };
-    scene.transform(gone, &stays_from_gone);
-    let views = std::mem::take(&mut scene.submaps[gone as usize].views);
-    for landmark in scene.landmarks_of(&views) {
-        scene.landmarks[landmark as usize].submap = stays;
+    let views = views_in_common(scene, inliers.iter().map(|ix| pairs[*ix]));
+    let overlap = overlap(scene, &views, &stays_from_gone, limits.max_error_px);
+    tracing::debug!(
+        stays,
+        gone,
+        n = inliers.len(),
+        ?overlap,
+        "submaps that share landmarks"
+    );
+    if !overlap.is_one_place() {
+        return false;
     }
-    for &view in &views {
-        if let Some(registered) = &mut scene.views[view].registered {
-            registered.submap = stays;
-        }
-    }
-    scene.unmerged.extend(&views);
-    scene.submaps[stays as usize].views.extend(views);
+    scene.absorb(stays, gone, &stays_from_gone);
     for ix in inliers {
         let (a, b) = pairs[ix];
         if !scene.landmarks[a as usize].seen.is_empty()
@@ -94,6 +98,29 @@ fn merge_pair(scene: &mut Reconstruction, stays: u32, gone: u32, limits: &Limits
     }
     adjust_global(scene, stays, limits.max_error_px, 15);
     true
+}
+
+/// The pairs of views that see most of the landmarks in common.
+pub(crate) fn views_in_common(
+    scene: &Reconstruction,
+    pairs: impl Iterator<Item = (u32, u32)>,
+) -> Vec<(usize, usize)> {
+    let seen = |landmark: u32| scene.landmarks[landmark as usize].seen.iter();
+    let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+    for (a, b) in pairs {
+        for (first, _) in seen(a) {
+            for (second, _) in seen(b) {
+                *counts
+                    .entry((*first as usize, *second as usize))
+                    .or_insert(0) += 1;
+            }
+        }
+    }
+    let mut ranked: Vec<(usize, (usize, usize))> =
+        counts.into_iter().map(|(v, n)| (n, v)).collect();
+    ranked.sort_by(|x, y| y.0.cmp(&x.0).then(x.1.cmp(&y.1)));
+    ranked.truncate(N_COMPARED);
+    ranked.into_iter().map(|r| r.1).collect()
 }
 
 /// Landmarks of two submaps that matches name as one: (of `a`, of `b`), each at most once.

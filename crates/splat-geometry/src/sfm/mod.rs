@@ -14,6 +14,10 @@ mod reconstruction;
 
 mod metric_submap;
 
+mod odometry;
+
+mod overlap;
+
 mod landmarks;
 
 mod adjust;
@@ -23,6 +27,8 @@ pub mod global_adjustment;
 mod pairwise;
 
 mod merge_submaps;
+
+mod join_submaps;
 
 mod close_loops;
 

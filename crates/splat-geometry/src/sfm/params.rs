@@ -39,6 +39,13 @@ pub struct SfmParams {
     /// (Kinect), 0.003 for a stereo camera of 5 cm (RealSense).
     #[schemars(range(min = 0.00001, max = 0.1), extend("unit" = "1/m"))]
     pub depth_noise: f64,
+    /// Standard deviation of the length of what odometry says, as a share of it: wheels 0.01 to 0.02, legs 0.05. It steadies the
+    /// scale along the way, and joins parts of a recording that share no view. 0: odometry has no part in poses.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub odometry_noise: f64,
+    /// The same of the heading, per metre of way: a car 0.1, a differential drive 1.
+    #[schemars(range(min = 0.0, max = 90.0), extend("unit" = "deg/m"))]
+    pub odometry_turn_noise: f64,
     /// Loop closures correct the trajectory between.
     pub loops: bool,
     /// Largest translation that a loop closure may apply, share of the trajectory between: ambiguous matches need
@@ -60,6 +67,8 @@ impl Default for SfmParams {
             focal_guess: 0.0,
             local_ba_prior: LocalBaPrior::Soft,
             depth_noise: 0.0014,
+            odometry_noise: 0.02,
+            odometry_turn_noise: 1.0,
             loops: true,
             max_loop_correction: 0.05,
         }

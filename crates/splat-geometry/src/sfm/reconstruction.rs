@@ -12,6 +12,7 @@ use crate::features::descriptor::Features;
 use crate::matching::PreparedDescriptors;
 use crate::optim::bundle::problem::MeasuredDepth;
 use crate::sfm::feature_depths::FeatureDepths;
+use crate::sfm::params::SfmParams;
 use crate::sfm::undistorted::Undistorted;
 use crate::two_view::triangulate::Observation;
 use splat_types::camera::{CameraModel, Distortion, Intrinsics};
@@ -98,6 +99,24 @@ pub(crate) struct Submap {
     pub(crate) is_metric: bool,
 }
 
+/// How far off odometry may be.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct OdometryNoise {
+    /// Standard deviations: of the length, as a share of it, and of the heading in radians per metre. 0: odometry is not used.
+    pub(crate) length: f64,
+    pub(crate) turn_per_metre: f64,
+}
+
+impl OdometryNoise {
+    pub(crate) fn new(params: &SfmParams) -> Self {
+        Self {
+            length: params.odometry_noise,
+            turn_per_metre: params.odometry_turn_noise.to_radians(),
+        }
+    }
+}
+
+/// All that is known. Many fields: every step of structure from motion looks at several of them.
 #[derive(Debug, Default)]
 pub(crate) struct Reconstruction {
     pub(crate) views: Vec<SfmView>,
@@ -117,6 +136,7 @@ pub(crate) struct Reconstruction {
     pub(crate) unmerged: BTreeSet<usize>,
     /// Views whose measured depth was not believed.
     pub(crate) n_wrong_depths: u64,
+    pub(crate) odometry_noise: OdometryNoise,
     /// Grows when a submap is adjusted as a whole, merged or dissolved, or a loop is closed.
     pub(crate) n_rebuilt: u64,
 }
@@ -387,6 +407,22 @@ impl Reconstruction {
                     .inverse();
             }
         }
+    }
+
+    /// Makes a submap part of another one, by how it lies to it.
+    pub(crate) fn absorb(&mut self, stays: u32, gone: u32, stays_from_gone: &Similarity) {
+        self.transform(gone, stays_from_gone);
+        let views = std::mem::take(&mut self.submaps[gone as usize].views);
+        for landmark in self.landmarks_of(&views) {
+            self.landmarks[landmark as usize].submap = stays;
+        }
+        for &view in &views {
+            if let Some(registered) = &mut self.views[view].registered {
+                registered.submap = stays;
+            }
+        }
+        self.unmerged.extend(&views);
+        self.submaps[stays as usize].views.extend(views);
     }
 
     /// Distances from a view to the landmarks it sees, along its axis.

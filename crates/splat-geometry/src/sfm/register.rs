@@ -9,8 +9,10 @@ use crate::sfm::adjust::{adjust_global, adjust_local};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
 use crate::sfm::metric_submap::drop_wrong_depth;
+use crate::sfm::overlap::overlap_with;
 use crate::sfm::pairwise::{pair_seed, release};
 use crate::sfm::reconstruction::{NONE, Reconstruction};
+use splat_types::transform::Rigid;
 
 /// Share of the candidate landmarks that must agree with a pose; and where there are fewer than `Limits::min_inliers` of them,
 /// down to half as many: an image of little texture has no more.
@@ -20,6 +22,10 @@ const MIN_SHARE_OF_FEW: f64 = 0.6;
 const CLEAR: usize = 3;
 /// Matches of a held link that speak against registering a view by other links alone, in landmarks that those name.
 const CLEARER: usize = 2;
+/// Views so near in order are of one stretch of the way, where nothing is taken for another thing that looks like it.
+const NEAR_VIEWS: usize = 8;
+/// Older views that one without such neighbours is compared with.
+const N_COMPARED: usize = 3;
 /// Growth of a submap after which all its views are adjusted together.
 const GLOBAL_GROWTH: f64 = 1.3;
 /// Of fewer views that takes no longer than a few keyframes do, so that it is never left to another thread.
@@ -78,6 +84,10 @@ fn register_best(
             scene.views[view].failed_with = n_pairs;
             continue;
         };
+        if !is_there(scene, view, &cam_from_world, &pairs, limits) {
+            scene.views[view].failed_with = n_pairs;
+            continue;
+        }
         drop_wrong_depth(scene, view, submap, &cam_from_world, &pairs);
         scene.place(view, submap, cam_from_world);
         extend(scene, view, limits.max_error_px);
@@ -88,6 +98,36 @@ fn register_best(
         });
     }
     None
+}
+
+/// Whether a view that only views long before speak for shows what they show; those just before it need no such check.
+fn is_there(
+    scene: &Reconstruction,
+    view: usize,
+    cam_from_world: &Rigid,
+    pairs: &[(u32, u32)],
+    limits: &Limits,
+) -> bool {
+    let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
+    for &(_, landmark) in pairs {
+        for &(other, _) in &scene.landmarks[landmark as usize].seen {
+            *counts.entry(other as usize).or_insert(0) += 1;
+        }
+    }
+    let n_near: usize = counts
+        .iter()
+        .filter(|(other, _)| other.abs_diff(view) <= NEAR_VIEWS)
+        .map(|(_, n)| *n)
+        .sum();
+    if n_near >= limits.min_inliers {
+        return true;
+    }
+    let mut others: Vec<(usize, usize)> = counts.into_iter().map(|(o, n)| (n, o)).collect();
+    others.sort_unstable_by(|a, b| b.cmp(a));
+    let others: Vec<usize> = others.into_iter().take(N_COMPARED).map(|o| o.1).collect();
+    let overlap = overlap_with(scene, &others, (view, cam_from_world), limits.max_error_px);
+    tracing::debug!(view, ?others, ?overlap, "a view by others long before");
+    overlap.is_one_place()
 }
 
 /// Adjusts about the last of the views that were registered; those whose landmarks are thrown out again wait on.
@@ -183,7 +223,7 @@ fn pose(
     view_ix: usize,
     pairs: &[(u32, u32)],
     limits: &Limits,
-) -> Option<splat_types::transform::Rigid> {
+) -> Option<Rigid> {
     let view = &scene.views[view_ix];
     let points: Vec<DVec3> = pairs
         .iter()

@@ -1,86 +1,27 @@
 //! What is known in metres beside the map -> metres of one map unit, with its standard deviation.
 //!
 //! A camera alone shows no lengths. Wheels, a depth camera, the height at which the camera is mounted or one measured
-//! distance do; each gives many ratios, of which some are wrong: the median of their logarithms, then Huber's mean.
-
-#[cfg(test)]
-mod tests;
+//! distance do; each gives many ratios, of which some are wrong.
 
 use crate::mapper::keyframes::metric_ratios;
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
 use crate::mapper::metric_scale_params::{MetricSource, ScaleParams};
 use splat_geometry::answer::MetricUnit;
+use splat_geometry::length_ratio::{LogRatio, of_odometry, robust};
 use splat_geometry::similarity;
 use splat_types::snapshot::{KeyframePose, Scale, ScaleSource};
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
-/// Ratios below which nothing is said.
-const MIN_RATIOS: usize = 5;
-/// A relative standard deviation above is no knowledge.
-const MAX_STD: f64 = 0.1;
-/// The path is cut into so many segments: long ones drown the noise of single poses, many report how well they agree.
-const N_SEGMENTS: f64 = 24.0;
-/// Huber's loss bends at so many standard deviations, for so many rounds.
-const HUBER: f64 = 1.5;
-const ROUNDS: usize = 5;
-/// Standard deviation of a normal distribution over its median absolute deviation.
-const NORMAL_MAD: f64 = 1.4826;
 /// What depth cameras and measured heights are off by in common, which no number of ratios shows.
 const DEPTH_ERROR: f64 = 0.005;
 const HEIGHT_ERROR: f64 = 0.02;
 /// Places that one measured distance rests on are known to such a share of it.
 const BASELINE_ERROR: f64 = 0.01;
 
-/// The logarithm of metres per unit.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Estimate {
-    log: f64,
-    std: f64,
-}
-
-/// Of independent ratios; `common` is what all of them may be off by together. `None` where they are few or disagree.
-fn robust(mut logs: Vec<f64>, common: f64) -> Option<Estimate> {
-    logs.retain(|l| l.is_finite());
-    if logs.len() < MIN_RATIOS {
-        return None;
-    }
-    logs.sort_by(f64::total_cmp);
-    let mut mean = logs[logs.len() / 2];
-    let mut off: Vec<f64> = logs.iter().map(|l| (l - mean).abs()).collect();
-    off.sort_by(f64::total_cmp);
-    let spread = (NORMAL_MAD * off[off.len() / 2]).max(1e-6);
-    let bend = HUBER * spread;
-    let mut n_effective = 0.0;
-    for _ in 0..ROUNDS {
-        let weight = |l: &f64| (bend / (l - mean).abs()).min(1.0);
-        n_effective = logs.iter().map(weight).sum::<f64>();
-        mean = logs.iter().map(|l| weight(l) * l).sum::<f64>() / n_effective;
-    }
-    let std = (spread * spread / n_effective + common * common).sqrt();
-    (std <= MAX_STD).then_some(Estimate { log: mean, std })
-}
-
-/// (world_from_cam, odom_from_cam in metres) of keyframes in order. Odometry drifts, so only its steps count.
-fn of_odometry(track: &[(Rigid, Rigid)], common: f64) -> Option<Estimate> {
-    let step = |a: &Rigid, b: &Rigid| (a.translation - b.translation).length();
-    let path: f64 = track.windows(2).map(|two| step(&two[0].0, &two[1].0)).sum();
-    let length = path / N_SEGMENTS;
-    let (mut logs, mut start) = (Vec::new(), track.first()?);
-    for end in track {
-        let in_world = step(&start.0, &end.0);
-        if in_world >= length && in_world > 0.0 {
-            // Where wheels say that nothing moved, the logarithm is no number and goes.
-            logs.push((step(&start.1, &end.1) / in_world).ln());
-            start = end;
-        }
-    }
-    robust(logs, common)
-}
-
 /// A distance that somebody measured between the camera's places at two times.
-fn of_baseline(poses: &[KeyframePose], (from, to, metres): (f64, f64, f64)) -> Option<Estimate> {
+fn of_baseline(poses: &[KeyframePose], (from, to, metres): (f64, f64, f64)) -> Option<LogRatio> {
     let first = poses.first()?.stamp;
     let nearest = |secs: f64| {
         let off = |p: &&KeyframePose| (p.stamp.secs_since(first) - secs).abs();
@@ -89,7 +30,7 @@ fn of_baseline(poses: &[KeyframePose], (from, to, metres): (f64, f64, f64)) -> O
     let (a, b) = (nearest(from)?, nearest(to)?);
     let units = (a.world_from_cam.translation - b.world_from_cam.translation).length();
     let log = (metres / units).ln();
-    log.is_finite().then_some(Estimate {
+    log.is_finite().then_some(LogRatio {
         log,
         std: BASELINE_ERROR,
     })
@@ -238,7 +179,7 @@ fn estimates<'a>(
     params: &ScaleParams,
     registered: impl Iterator<Item = &'a RegisteredKeyframe>,
     poses: &[KeyframePose],
-) -> Vec<(ScaleSource, Option<Estimate>)> {
+) -> Vec<(ScaleSource, Option<LogRatio>)> {
     let may = |known: MetricSource| params.source == MetricSource::Auto || params.source == known;
     let registered: Vec<&RegisteredKeyframe> = registered.collect();
     let all = |which: usize| {

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use crate::optim::bundle::problem::{Camera, Flat, MeasuredDepth, State, project, strayed, times};
 use crate::optim::bundle::reduced::{HELD, LENS, Layout, Solution, System};
+use crate::optim::bundle::relative_motion::{self, MotionRows};
 
 /// Chunks of points that are summed apart.
 const CHUNKS: usize = 8;
@@ -43,6 +44,7 @@ pub(crate) struct Normal {
     chunks: Vec<Chunk>,
     /// Of the poses that are held softly: (block row, information, gradient).
     holds: Vec<(usize, [[f64; 6]; 6], [f64; 6])>,
+    motions: Vec<MotionRows>,
 }
 
 impl Normal {
@@ -70,7 +72,11 @@ pub(crate) fn linearise(flat: &Flat<'_>, state: &State, layout: &Layout) -> Norm
             holds.push((layout.slot_of[i] as usize, information, gradient));
         }
     }
-    Normal { chunks, holds }
+    Normal {
+        chunks,
+        holds,
+        motions: relative_motion::linearise(&state.cameras, flat, layout),
+    }
 }
 
 fn chunk(
@@ -231,6 +237,7 @@ pub(crate) fn eliminate(
         }
         (0..6).for_each(|k| system.gradient[*slot][k] += gradient[k]);
     }
+    relative_motion::add(&mut system, &normal.motions, damping);
     system
 }
 

@@ -50,6 +50,17 @@ impl MeasuredDepth {
     }
 }
 
+/// A motion between two cameras that something other than the images measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RelativeMotion {
+    pub first_ix: u32,
+    pub second_ix: u32,
+    /// In units of the world.
+    pub first_from_second: Rigid,
+    /// Standard deviations: along each axis in units of the world, about each axis in radians.
+    pub std: [f64; 2],
+}
+
 /// Points are added with `add_point`, which keeps their observations side by side.
 #[derive(Debug, Clone, Default)]
 pub struct Problem {
@@ -58,6 +69,8 @@ pub struct Problem {
     pub(crate) observations: Vec<Observation>,
     /// By point: where its observations end.
     pub(crate) ends: Vec<usize>,
+    /// Between cameras, by odometry.
+    pub motions: Vec<RelativeMotion>,
 }
 
 impl Problem {
@@ -113,6 +126,7 @@ impl State {
 pub(crate) struct Flat<'a> {
     pub(crate) observations: &'a [Observation],
     pub(crate) ends: &'a [usize],
+    pub(crate) motions: &'a [RelativeMotion],
     pub(crate) start: Vec<Camera>,
     pub(crate) loss_px: f64,
     pub(crate) moves: [bool; LENS],

@@ -1,11 +1,11 @@
-//! Scale by odometry, depth images and the floor.
+//! Metres by wheels that are noisy, slip and rest.
 
 use glam::{DQuat, DVec3};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
-use crate::mapper::metric_scale::*;
-use splat_geometry::ground_truth::noise::normal;
+use crate::ground_truth::noise::normal;
+use crate::length_ratio::*;
 
 fn at(place: DVec3) -> Rigid {
     Rigid::new(DQuat::IDENTITY, place)
