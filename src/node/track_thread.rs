@@ -191,6 +191,7 @@ impl TrackStage {
                     tracked
                 },
                 odom_from_cam: frame.odometry,
+                is_odometry_out: self.tracker.as_ref().is_some_and(Tracker::is_odometry_out),
                 base_from_cam: None,
                 moved,
                 latency_secs: since.secs(),

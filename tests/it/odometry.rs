@@ -83,3 +83,54 @@ fn wheels_that_slip_do_not_move_the_map() {
     eprintln!("slip: {with:.4} with odometry, {without:.4} without");
     assert!(with < 0.02, "{with}");
 }
+
+/// What becomes of odometry after the middle of the recording, by the number of the keyframe and what it was.
+type Fault = fn(usize, &[Rigid]) -> Option<Rigid>;
+
+const FAULTS: [(&str, Fault); 4] = [
+    ("unplugged", |_, _| None),
+    ("frozen", |ix, track| Some(track[ix.min(track.len() / 2)])),
+    ("20 % too long", |ix, track| {
+        let from = track.len() / 2;
+        let base = track[from.min(ix)];
+        let mut step = base.inverse() * track[ix];
+        step.translation *= 1.2;
+        Some(base * step)
+    }),
+    // Two keyframes are 0.2 s apart.
+    ("0.1 s late", |ix, track| {
+        let step = track[ix - 1].inverse() * track[ix];
+        let late = Rigid::new(
+            glam::DQuat::IDENTITY.slerp(step.rotation, 0.5),
+            step.translation * 0.5,
+        );
+        Some(track[ix - 1] * late)
+    }),
+];
+
+#[test]
+fn odometry_that_fails_in_the_middle_does_not_move_the_map() {
+    let keyframes = keyframes_of(SLIP, EVERY);
+    let track: Vec<Rigid> = keyframes
+        .iter()
+        .map(|k| k.frame.odometry.unwrap())
+        .collect();
+    for (name, fault) in FAULTS {
+        let faulty: Vec<Arc<Keyframe>> = (0..)
+            .zip(&keyframes)
+            .map(|(ix, keyframe)| {
+                let mut keyframe = Keyframe::clone(keyframe);
+                if 2 * ix > track.len() {
+                    keyframe.frame.odometry = fault(ix, &track);
+                }
+                Arc::new(keyframe)
+            })
+            .collect();
+        let submaps = submaps(&faulty);
+        let largest = submaps.values().max_by_key(|poses| poses.len()).unwrap();
+        assert_eq!(largest.len(), keyframes.len(), "{name}");
+        let error = position_error(&pairs(&keyframes, largest));
+        eprintln!("{name}: {error:.4}");
+        assert!(error < 0.02, "{name}: {error}");
+    }
+}

@@ -17,6 +17,8 @@ pub struct PoseEvent {
     pub tracked: TrackedFrame,
     /// What wheels say of the camera at that time.
     pub odom_from_cam: Option<Rigid>,
+    /// They disagree with the camera.
+    pub is_odometry_out: bool,
     pub base_from_cam: Option<Rigid>,
     /// How the map has moved under the camera since the frame before.
     pub moved: Option<Similarity>,
@@ -287,6 +289,7 @@ mod tests {
                 n_inliers: 50,
             },
             odom_from_cam: None,
+            is_odometry_out: false,
             base_from_cam: None,
             moved: None,
             latency_secs: 0.0,

@@ -94,6 +94,8 @@ pub struct TrackStatus {
     pub reason: String,
     pub n_tracked: u64,
     pub n_missed: u64,
+    /// Odometry disagrees with the camera.
+    pub is_odometry_out: bool,
     pub frame_to_pose: Times,
 }
 
@@ -182,6 +184,12 @@ impl Status<'_> {
         if self.map.n_submaps > 1 {
             let n = self.map.n_submaps;
             warnings.push(format!("{n} parts of the input do not hang together"));
+        }
+        if self.track.is_odometry_out {
+            warnings.push(
+                "odometry disagrees with the camera and is left out: wheels slip, or its stamps or its mounting are wrong"
+                    .to_owned(),
+            );
         }
         if !self.grid.refused.is_empty() {
             warnings.push(format!("no grid: {}", self.grid.refused));

@@ -37,6 +37,7 @@ impl StatusStream {
         status.stamp = tracked.stamp;
         status.state = Some(tracked.state);
         status.reason = tracked.reason.map(|r| r.to_string()).unwrap_or_default();
+        status.is_odometry_out = frame.is_odometry_out;
         status.n_tracked += u64::from(tracked.is_measured());
         status.n_missed += u64::from(!tracked.is_measured());
         status.frame_to_pose.note(frame.latency_secs);

@@ -10,6 +10,8 @@ use splat_types::transform::{Rigid, Similarity};
 
 /// A submap whose unit is known no better is not joined to another.
 const MAX_SCALE_STD: f64 = 0.03;
+/// Views of a submap on either side of the one next to a gap, between which odometry must agree with the images.
+const N_BESIDE: usize = 6;
 /// Pairs of keyframes on either side of a gap that say how it is crossed.
 const N_ACROSS: usize = 4;
 /// A gap that is crossed with a larger standard deviation of the turn, in radians, stays open.
@@ -28,8 +30,7 @@ pub(crate) fn join_by_odometry(scene: &mut Reconstruction, limits: &Limits) -> b
         let is_there = !scene.submaps[submap as usize].views.is_empty();
         let scale = is_there.then(|| metres_per_unit(scene, submap))??;
         let unit = scale.log.exp();
-        let agrees = || misfit(scene, submap, unit).is_some_and(|off| off <= MAX_MISFIT);
-        (scale.std <= MAX_SCALE_STD && agrees()).then_some(Joinable { submap, unit })
+        (scale.std <= MAX_SCALE_STD).then_some(Joinable { submap, unit })
     };
     let all: Vec<Joinable> = (0..scene.submaps.len() as u32)
         .filter_map(joinable)
@@ -81,6 +82,7 @@ fn crossing(scene: &Reconstruction, stays: &Joinable, gone: &Joinable) -> Option
     }
     pairs.sort_unstable();
     let scale = gone.unit / stays.unit;
+    let mut nearest = None;
     let (mut gap, mut gap_m, mut turn_std) = (0, 0.0, f64::INFINITY);
     let mut found: Vec<(DQuat, DVec3, Rigid, f64)> = Vec::new();
     for (away, a, b) in pairs {
@@ -88,6 +90,7 @@ fn crossing(scene: &Reconstruction, stays: &Joinable, gone: &Joinable) -> Option
             continue;
         };
         if found.is_empty() {
+            nearest = Some((a, b));
             (gap, gap_m) = (away, motion.first_from_second.translation.length());
         }
         turn_std = turn_std.min(motion.std[1]);
@@ -103,7 +106,14 @@ fn crossing(scene: &Reconstruction, stays: &Joinable, gone: &Joinable) -> Option
             break;
         }
     }
-    if found.is_empty() || turn_std > MAX_TURN_STD {
+    let agrees = |own: &Joinable, at: usize| {
+        let views = in_time(scene, own.submap);
+        let ix = views.partition_point(|view| *view < at);
+        let beside = &views[ix.saturating_sub(N_BESIDE)..(ix + N_BESIDE).min(views.len())];
+        misfit(scene, beside, own.unit).is_some_and(|off| off <= MAX_MISFIT)
+    };
+    let (a, b) = nearest?;
+    if turn_std > MAX_TURN_STD || !agrees(stays, a) || !agrees(gone, b) {
         return None;
     }
     let total: f64 = found.iter().map(|f| f.3).sum();

@@ -21,7 +21,7 @@ const TURN_SHARE: f64 = 0.02;
 /// Faster than that, in metres and radians per second, odometry has begun anew.
 const MAX_SPEED: f64 = 40.0;
 const MAX_TURN_SPEED: f64 = 10.0;
-/// Odometry that is off by so many standard deviations, in the median over the motions of a submap, joins nothing; and the motions
+/// Odometry that is off by so many standard deviations, in the median over the motions beside a gap, joins nothing across it; and the motions
 /// that this takes.
 pub(crate) const MAX_MISFIT: f64 = 3.0;
 const MIN_MOTIONS: usize = 4;
@@ -144,10 +144,9 @@ pub(crate) fn std_between(
     Some([place / unit, turn])
 }
 
-/// By how many standard deviations odometry and the images disagree on the motions within a submap, in the median; `None` of too
-/// few.
-pub(crate) fn misfit(scene: &Reconstruction, submap: u32, unit: f64) -> Option<f64> {
-    let views = in_time(scene, submap);
+/// By how many standard deviations odometry and the images disagree on the motions between views that follow one another, in the
+/// median; `None` of too few. `unit` is in metres.
+pub(crate) fn misfit(scene: &Reconstruction, views: &[usize], unit: f64) -> Option<f64> {
     let off = |two: &[usize]| {
         let own = motion(scene, two[0], two[1])?;
         let seen = world_from_cam(scene, two[0])?.inverse() * world_from_cam(scene, two[1])?;

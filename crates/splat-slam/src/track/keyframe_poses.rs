@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use nalgebra::{Matrix6, Vector6};
 
+use crate::track::anchor::Anchor;
 use splat_types::transform::Rigid;
 
 /// A keyframe has its place when so many newer ones have theirs.
@@ -37,6 +38,14 @@ pub(crate) struct KeyframePoses {
 impl KeyframePoses {
     pub(crate) fn get(&self, id: &u32) -> Option<&(Rigid, f64)> {
         self.poses.get(id)
+    }
+
+    /// `world_from_cam` of a frame by the keyframe's pose of this moment; `None` where the map has it no more.
+    pub(crate) fn pose_by(&self, anchor: &Anchor) -> Option<Rigid> {
+        let (world_from_key, unit) = self.get(&anchor.keyframe_id)?;
+        let mut key_from_cam = anchor.key_from_cam;
+        key_from_cam.translation *= unit / anchor.unit;
+        Some(*world_from_key * key_from_cam)
     }
 
     /// Of a saved map.

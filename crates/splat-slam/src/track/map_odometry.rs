@@ -1,9 +1,10 @@
 //! Visual odometry, and what its poses are in the map: by the newest keyframe, or before there is one.
 
 use crate::track::align::AlignmentFrame;
+use crate::track::anchor::Anchor;
 use crate::track::landmarks::KeyframeView;
 use crate::track::odometry_link::{LinkedKeyframe, LinkedMotion, LinkedPose, OdometryLink};
-use crate::track::wheel_odometry::WheelOdometry;
+use crate::track::wheel_odometry::{MeasuredFrame, WheelOdometry};
 use crate::visual_odometry::odometry::{OdometryPose, VisualOdometry};
 use crate::working_camera::WorkingCamera;
 use splat_types::camera::Intrinsics;
@@ -75,9 +76,14 @@ impl MapOdometry {
         Some(AlignmentFrame { pyramid, camera })
     }
 
+    /// What the source's odometry says of one more frame, whatever its image shows.
+    pub(crate) fn follow_wheels(&mut self, frame: &Frame) {
+        self.wheels.push(frame);
+    }
+
     /// Odometry of one more frame.
     pub(crate) fn follow(&mut self, frame: &Frame) -> Option<OdometryPose> {
-        self.wheels.push(frame);
+        self.follow_wheels(frame);
         let odometry = self.odometry.as_mut()?;
         let size = (frame.image.width_px, frame.image.height_px);
         let is_same = |known: &FrameCamera| {
@@ -104,18 +110,37 @@ impl MapOdometry {
 
     /// Where a frame is by a keyframe and the source's odometry since.
     pub(crate) fn locate_by_wheels(&self, seq: u64) -> Option<LinkedPose> {
-        self.wheels.link.locate(seq)
+        self.trusted_wheels()?.link.locate(seq)
     }
 
     /// How the camera has moved between two frames by the source's odometry.
     pub(crate) fn motion_by_wheels(&self, earlier: u64, later: u64) -> Option<LinkedMotion> {
-        self.wheels.link.motion(earlier, later)
+        self.trusted_wheels()?.link.motion(earlier, later)
     }
 
     /// The pose of a frame that the map has reached in the keyframe before it, by the keyframes on both sides.
     pub(crate) fn between_keyframes(&self, seq: u64) -> Option<(u32, Rigid)> {
         let by_images = self.link.between_keyframes(seq);
-        by_images.or_else(|| self.wheels.link.between_keyframes(seq))
+        by_images.or_else(|| self.trusted_wheels()?.link.between_keyframes(seq))
+    }
+
+    fn trusted_wheels(&self) -> Option<&WheelOdometry> {
+        (!self.wheels.is_out()).then_some(&self.wheels)
+    }
+
+    /// Whether odometry of the source disagrees with the camera and is left out.
+    pub(crate) fn is_source_out(&self) -> bool {
+        self.wheels.is_out()
+    }
+
+    /// One more frame whose place was measured in the map, as `WheelOdometry::compare` takes it.
+    pub(crate) fn compare(
+        &mut self,
+        frame: MeasuredFrame,
+        scene_depth: f64,
+        pose_of: impl Fn(&Anchor) -> Option<Rigid>,
+    ) {
+        self.wheels.compare(frame, scene_depth, pose_of);
     }
 
     /// Whether a pose is to be reported in odometry's frame, as there is no map: the first segment's.

@@ -16,13 +16,13 @@ mod map_points;
 
 mod align;
 
+mod anchor;
+
 mod keyframe_poses;
 
 mod matching;
 
 mod landmark_file;
-
-mod anchor;
 
 mod odometry_link;
 

@@ -162,6 +162,7 @@ impl Tracker {
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
         let tracked = if repeats(self.last.as_ref(), frame) {
+            self.odometry.follow_wheels(frame);
             self.repeated((frame.seq, frame.stamp))
         } else {
             self.look_at(frame)
@@ -207,8 +208,8 @@ impl Tracker {
                 let before_map = odometry.filter(|pose| self.odometry.reports_before_map(pose));
                 match (before_map, wheels) {
                     (Some(pose), _) => return self.ahead_of_map(seen, &pose),
-                    (None, Some((linked, pose))) => {
-                        return self.bridged(seen, reason, &linked, &pose);
+                    (None, Some(linked)) => {
+                        return self.bridged(at, Some(seen), reason, &linked);
                     }
                     (None, None) => self.missed(at, reason),
                 }
@@ -253,6 +254,11 @@ impl Tracker {
                 self.retry_frame(&oldest);
             }
         }
+    }
+
+    /// Whether odometry of the source disagrees with the camera and is left out.
+    pub fn is_odometry_out(&self) -> bool {
+        self.odometry.is_source_out()
     }
 
     /// Whether the pose of the last frame is in odometry's frame and unit, as there is no map yet.
@@ -510,10 +516,7 @@ impl Tracker {
 
     /// `world_from_cam` by the keyframe's pose of this moment; `None` where the map has it no more.
     fn pose_by(&self, anchor: &Anchor) -> Option<Rigid> {
-        let (world_from_key, unit) = self.keyframes.get(&anchor.keyframe_id)?;
-        let mut key_from_cam = anchor.key_from_cam;
-        key_from_cam.translation *= unit / anchor.unit;
-        Some(*world_from_key * key_from_cam)
+        self.keyframes.pose_by(anchor)
     }
 
     fn scene_depth(&self) -> f64 {

@@ -1,6 +1,12 @@
 //! Odometry that comes with the frames, such as that of wheels, as the tracker goes on by where the camera sees nothing.
+//!
+//! Wheels slip, drivers freeze and stamps are wrong. What odometry says of the last half second is compared with what the map
+//! has measured; where both disagree for a second, odometry is left out until they have agreed for five.
 
-use crate::track::odometry_link::OdometryLink;
+use std::collections::VecDeque;
+
+use crate::track::anchor::Anchor;
+use crate::track::odometry_link::{LinkedMotion, OdometryLink};
 use crate::visual_odometry::odometry::OdometryPose;
 use splat_types::frame::Frame;
 use splat_types::time::Stamp;
@@ -11,6 +17,18 @@ const MAX_SPEED: f64 = 40.0;
 const MAX_TURN_SPEED: f64 = 10.0;
 const MIN_SECS: f64 = 0.02;
 
+/// Motions over so many seconds are compared, and at most over so many.
+const COMPARED_SECS: f64 = 0.5;
+const MAX_COMPARED_SECS: f64 = 2.0;
+/// Standard deviations by which odometry may be off on average over its axes; and what a measured pose may be off by: radians, and
+/// as a share of the scene's depth.
+const MAX_MISFIT: f64 = 4.0;
+const MEASURED_TURN_STD: f64 = 0.004;
+const MEASURED_STD: f64 = 0.004;
+/// Seconds of disagreement after which odometry is out, and of agreement after which it is taken back.
+const OUT_AFTER_SECS: f64 = 0.8;
+const BACK_AFTER_SECS: f64 = 5.0;
+
 /// Poses by odometry, and how they lie in the map.
 #[derive(Debug, Default)]
 pub(crate) struct WheelOdometry {
@@ -18,6 +36,49 @@ pub(crate) struct WheelOdometry {
     last: Option<(Stamp, Rigid)>,
     /// Grows when odometry begins anew.
     segment: u32,
+    check: Check,
+}
+
+/// A frame whose place was measured.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct MeasuredFrame {
+    pub(crate) seq: u64,
+    pub(crate) stamp: Stamp,
+    pub(crate) anchor: Anchor,
+}
+
+/// Whether odometry is believed.
+#[derive(Debug, Default)]
+struct Check {
+    measured: VecDeque<MeasuredFrame>,
+    /// Since when it has been otherwise than `is_out` says.
+    other_since: Option<Stamp>,
+    is_out: bool,
+}
+
+impl Check {
+    fn note(&mut self, stamp: Stamp, is_off: bool) {
+        if is_off == self.is_out {
+            self.other_since = None;
+            return;
+        }
+        let since = *self.other_since.get_or_insert(stamp);
+        let needed = if self.is_out {
+            BACK_AFTER_SECS
+        } else {
+            OUT_AFTER_SECS
+        };
+        if stamp.secs_since(since) >= needed {
+            (self.is_out, self.other_since) = (is_off, None);
+            if is_off {
+                tracing::warn!(
+                    "odometry disagrees with the camera since {since} and is left out until it agrees for {BACK_AFTER_SECS} s"
+                );
+            } else {
+                tracing::info!("odometry agrees with the camera again at {stamp}");
+            }
+        }
+    }
 }
 
 impl WheelOdometry {
@@ -43,5 +104,147 @@ impl WheelOdometry {
             n_inliers: 0,
         };
         self.link.push(frame.seq, Some(pose));
+    }
+
+    /// Whether odometry has disagreed with what the map measured.
+    pub(crate) fn is_out(&self) -> bool {
+        self.check.is_out
+    }
+
+    /// One more frame whose place was measured; `pose_of` gives those of frames before by the map of this moment.
+    pub(crate) fn compare(
+        &mut self,
+        frame: MeasuredFrame,
+        scene_depth: f64,
+        pose_of: impl Fn(&Anchor) -> Option<Rigid>,
+    ) {
+        let age = |other: &MeasuredFrame| frame.stamp.secs_since(other.stamp);
+        let measured = &mut self.check.measured;
+        while measured
+            .front()
+            .is_some_and(|first| !(0.0..MAX_COMPARED_SECS).contains(&age(first)))
+        {
+            measured.pop_front();
+        }
+        let start = measured.iter().rev().find(|f| age(f) >= COMPARED_SECS);
+        let compared = start.copied().and_then(|start| {
+            let motion = self.link.motion(start.seq, frame.seq)?;
+            let measured = pose_of(&start.anchor)?.inverse() * pose_of(&frame.anchor)?;
+            Some(misfit(&motion, &measured, scene_depth))
+        });
+        if let Some(misfit) = compared {
+            self.check.note(frame.stamp, misfit > MAX_MISFIT);
+        }
+        self.check.measured.push_back(frame);
+    }
+}
+
+/// By how many standard deviations two motions differ, the larger of place and turn.
+fn misfit(motion: &LinkedMotion, measured: &Rigid, scene_depth: f64) -> f64 {
+    let std = |axes: std::ops::Range<usize>, floor: f64| {
+        let variance = axes.map(|i| motion.covariance[(i, i)]).sum::<f64>() / 3.0;
+        (variance + floor * floor).sqrt()
+    };
+    let off = motion.earlier_from_later.inverse() * *measured;
+    let place = off.translation.length() / std(0..3, MEASURED_STD * scene_depth);
+    let turn = off.angle_to(&Rigid::IDENTITY) / std(3..6, MEASURED_TURN_STD);
+    place.max(turn) / 3.0_f64.sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+    use crate::track::odometry_link::LinkedKeyframe;
+
+    fn way(seq: u64) -> Rigid {
+        let secs = seq as f64 * 0.1;
+        let place = DVec3::new(0.6 * secs, 0.1 * (1.3 * secs).sin(), 0.0);
+        Rigid::new(DQuat::from_rotation_z(0.3 * (0.7 * secs).sin()), place)
+    }
+
+    fn stamp(seq: u64) -> Stamp {
+        Stamp::from_nanos(seq as i64 * 100_000_000)
+    }
+
+    /// Frames of the way at 10 Hz, and a keyframe every fifth until the fault: seconds of the frames after which odometry was
+    /// out, and back.
+    fn run(fault: impl Fn(u64) -> Rigid) -> (Option<f64>, Option<f64>) {
+        let mut wheels = WheelOdometry::default();
+        let (mut out, mut back) = (None, None);
+        for seq in 0..200 {
+            let pose = OdometryPose {
+                segment: 0,
+                odometry_from_cam: fault(seq),
+                covariance: Default::default(),
+                n_inliers: 0,
+            };
+            wheels.link.push(seq, Some(pose));
+            if seq % 5 == 0 && seq <= 50 {
+                let keyframes = (0..=seq / 5).map(|id| LinkedKeyframe {
+                    id: id as u32,
+                    seq: 5 * id,
+                    world_from_cam: way(5 * id),
+                });
+                wheels.link.update(keyframes);
+            }
+            let anchor = Anchor {
+                keyframe_id: 0,
+                key_from_cam: way(seq),
+                unit: 1.0,
+            };
+            let frame = MeasuredFrame {
+                seq,
+                stamp: stamp(seq),
+                anchor,
+            };
+            wheels.compare(frame, 2.0, |anchor| Some(anchor.key_from_cam));
+            let secs = seq as f64 * 0.1;
+            match wheels.is_out() {
+                true if out.is_none() => out = Some(secs),
+                false if out.is_some() && back.is_none() => back = Some(secs),
+                _ => {}
+            }
+        }
+        (out, back)
+    }
+
+    #[test]
+    fn odometry_that_agrees_is_never_left_out() {
+        assert_eq!(run(way), (None, None));
+    }
+
+    #[test]
+    fn odometry_that_freezes_for_a_while_is_left_out_and_taken_back() {
+        let (out, back) = run(|seq| match seq {
+            0..60 => way(seq),
+            60..100 => way(60),
+            _ => way(60) * (way(100).inverse() * way(seq)),
+        });
+        let (out, back) = (out.unwrap(), back.unwrap());
+        assert!((6.0..7.6).contains(&out), "out after {out} s");
+        assert!((14.5..16.5).contains(&back), "back after {back} s");
+    }
+
+    #[test]
+    fn odometry_with_a_wrong_length_or_heading_is_left_out() {
+        let long = run(|seq| {
+            let mut pose = way(seq);
+            pose.translation.x *= if seq < 60 { 1.0 } else { 1.3 };
+            pose
+        });
+        assert!(
+            long.0.is_some_and(|out| (6.0..8.0).contains(&out)),
+            "{long:?}"
+        );
+        let turned = run(|seq| {
+            let wrong = 0.02 * seq.saturating_sub(60) as f64;
+            way(seq) * Rigid::new(DQuat::from_rotation_z(wrong), DVec3::ZERO)
+        });
+        assert!(
+            turned.0.is_some_and(|out| (6.0..8.0).contains(&out)),
+            "{turned:?}"
+        );
     }
 }

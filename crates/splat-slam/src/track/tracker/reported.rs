@@ -10,6 +10,7 @@ use crate::track::anchor::Anchor;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
 use crate::track::odometry_link::LinkedPose;
+use crate::track::wheel_odometry::MeasuredFrame;
 use crate::visual_odometry::odometry::OdometryPose;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
@@ -46,6 +47,10 @@ impl Tracker {
             anchor,
             covariance,
         });
+        let (depth, keyframes) = (self.scene_depth(), &self.keyframes);
+        let measured = MeasuredFrame { seq, stamp, anchor };
+        self.odometry
+            .compare(measured, depth, |anchor| keyframes.pose_by(anchor));
         let points = found.points.as_deref().zip(self.odometry.newest());
         if let Some((points, frame)) = points {
             let points = points.iter().map(|p| (p.id, p.point_in_world, p.pixel));
@@ -106,10 +111,10 @@ impl Tracker {
     /// lost.
     pub(super) fn bridged(
         &mut self,
-        seen: Arc<Observation>,
+        at: (u64, Stamp),
+        seen: Option<Arc<Observation>>,
         reason: LostReason,
-        linked: &LinkedPose,
-        world_from_cam: &Rigid,
+        (linked, world_from_cam): &(LinkedPose, Rigid),
     ) -> TrackedFrame {
         let worst = |axes: std::ops::Range<usize>| {
             let variances = axes.map(|i| linked.covariance[(i, i)]);
@@ -118,15 +123,15 @@ impl Tracker {
         let is_sure = worst(0..3) < MAX_BRIDGED_STD * self.scene_depth()
             && worst(3..6) < MAX_BRIDGED_TURN_STD;
         if !is_sure || matches!(self.state, TrackState::Initialising | TrackState::Lost) {
-            let tracked = self.missed((seen.seq, seen.stamp), reason);
-            self.keep(Some(seen), &tracked, None);
+            let tracked = self.missed(at, reason);
+            self.keep(seen, &tracked, None);
             return tracked;
         }
         self.search.n_failed += 1;
         self.state = TrackState::Tracking;
         let tracked = TrackedFrame {
-            seq: seen.seq,
-            stamp: seen.stamp,
+            seq: at.0,
+            stamp: at.1,
             state: self.state,
             reason: Some(reason),
             pose: Some(TrackedPose {
@@ -136,7 +141,7 @@ impl Tracker {
             }),
             n_inliers: 0,
         };
-        self.keep(Some(seen), &tracked, None);
+        self.keep(seen, &tracked, None);
         let unit = self.keyframes.get(&linked.keyframe_id);
         let anchor = linked.anchor(unit.map_or(1.0, |(_, unit)| *unit));
         if let Some(entry) = self.history.frames.last_mut() {
@@ -182,6 +187,9 @@ impl Tracker {
     /// The image of the frame before has come again.
     pub(super) fn repeated(&mut self, frame: (u64, Stamp)) -> TrackedFrame {
         let reason = LostReason::Repeated;
+        if let Some(linked) = self.linked_by_wheels(frame.0) {
+            return self.bridged(frame, None, reason, &linked);
+        }
         let tracked = if self.motion.is_some() {
             self.missed(frame, reason)
         } else {
