@@ -1,11 +1,14 @@
 //! Waiting views -> a new submap: the pair with most parallax, its landmarks, and all that can be registered on them.
 
+use std::collections::BTreeMap;
+
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::pnp;
 use crate::sfm::adjust::{adjust_global, median_error_px};
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
+use crate::sfm::odometry::{MAX_MISFIT, turn_misfit, world_from_cam};
 use crate::sfm::pairwise::{pair_seed, pixel_pairs};
 use crate::sfm::reconstruction::{NONE, Reconstruction, Submap};
 use crate::sfm::register::grow;
@@ -25,7 +28,7 @@ const MUCH_PARALLAX_DEG: f64 = 100.0;
 /// Share of matches on one plane from which on a pair is a poor start: two motions explain it about equally well.
 const PLANE_SHARE: f64 = 0.85;
 /// Share from which on both motions are tried: the one that five points gave may be the plane's wrong one.
-const HALF_PLANE_SHARE: f64 = 0.5;
+const HALF_PLANE_SHARE: f64 = 0.35;
 
 /// A start that places this share of the waiting views is taken without trying other pairs.
 const GOOD_SHARE: f64 = 0.7;
@@ -36,10 +39,14 @@ const MIN_EXPLAINED: f64 = 0.62;
 /// 0.65 with a focal length 26 % off.
 const MIN_EXPLAINED_FREE: f64 = 0.72;
 
-/// Two motions of a plane that both explain this share of what the better one does, in fewer views than that: neither is believed. Three views
-/// that go through a door explained 0.84 by one and 0.86 by the other, which was wrong; eight, 0.93 and 0.54.
-const ALIKE: f64 = 0.85;
-const DECISIVE: usize = 6;
+/// A start that explains this share of the matches is taken for right; one that explains less is compared with what other pairs of views,
+/// and the other motion of a plane, say. Blurred images before a wall of prints explained 0.83 by a motion that was 11 degrees wrong, and 0.75 by
+/// the right one.
+const CLEARLY_EXPLAINED: f64 = 0.88;
+/// Two starts that both explain this share of what the better one does, and differ by such a turn in radians: neither is believed until
+/// more keyframes have come. Three views that go through a door explained 0.84 by one and 0.86 by the other, which was wrong; eight, 0.93 and 0.54.
+const ALIKE: f64 = 0.8;
+const SAME_TURN: f64 = 0.05;
 
 /// What came of trying to start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,44 +80,93 @@ pub(crate) fn start(
             Start::NoMatches
         };
     }
-    let (mut best, mut is_enough) = (None::<(usize, FirstPair)>, false);
+    let mut found: Vec<Candidate> = Vec::new();
     for pair in pairs.into_iter().take(MAX_ATTEMPTS) {
         let other = pair.other_motion(scene);
-        let (before, mut explained) = (best, Vec::new());
         for pair in [Some(pair), other].into_iter().flatten() {
             let Some(made) = attempt(scene, &waiting, &pair, min_views, limits) else {
                 continue;
             };
-            explained.push(made.n_explained as f64);
             let is_good = made.n_views as f64 >= GOOD_SHARE * waiting.len() as f64;
-            if is_good && other.is_none() {
+            let is_clear = pair.is_metric || made.explained >= CLEARLY_EXPLAINED;
+            if is_good && is_clear && other.is_none() && found.is_empty() {
                 return Start::Started;
             }
             // Another pair may reach more views, and the other motion be the true one.
             let last = scene.submaps.len() as u32 - 1;
+            let poses = poses_of(scene, last);
             scene.dissolve(last);
-            is_enough |= is_good;
-            if best.as_ref().is_none_or(|b| made.n_explained > b.0) {
-                best = Some((made.n_explained, pair));
-            }
+            found.push(Candidate {
+                pair,
+                n_explained: made.n_explained,
+                is_enough: is_good && is_clear,
+                poses,
+            });
         }
-        if let [one, another] = explained[..]
-            && one.min(another) > ALIKE * one.max(another)
-            && waiting.len() < DECISIVE
-        {
-            // The next keyframes decide.
-            (best, is_enough) = (before, false);
-        }
-        if is_enough {
+        if found.iter().any(|candidate| candidate.is_enough) {
             break;
         }
     }
-    let again = best.and_then(|(_, pair)| attempt(scene, &waiting, &pair, min_views, limits));
+    prefer_by_odometry(scene, &mut found);
+    let best = found.iter().max_by_key(|candidate| candidate.n_explained);
+    let again = best
+        .filter(|best| !found.iter().any(|other| other.rivals(best)))
+        .and_then(|best| attempt(scene, &waiting, &best.pair, min_views, limits));
     if again.is_some() {
         Start::Started
     } else {
         Start::Unstable
     }
+}
+
+/// A start that held, and was taken apart again.
+struct Candidate {
+    pair: FirstPair,
+    n_explained: usize,
+    /// No other pair needs to be tried.
+    is_enough: bool,
+    /// `world_from_cam` by view.
+    poses: BTreeMap<usize, Rigid>,
+}
+
+impl Candidate {
+    /// Whether this start explains about as much as the best one, and says something else.
+    fn rivals(&self, best: &Self) -> bool {
+        let is_alike = self.n_explained as f64 > ALIKE * best.n_explained as f64;
+        is_alike && turned_between(&self.poses, &best.poses) > SAME_TURN
+    }
+}
+
+/// The largest angle by which two sets of poses disagree on the turn between two views, in radians; of the views that both have.
+fn turned_between(a: &BTreeMap<usize, Rigid>, b: &BTreeMap<usize, Rigid>) -> f64 {
+    let mut both = a
+        .iter()
+        .filter_map(|(view, pose)| Some((pose, b.get(view)?)));
+    let Some(first) = both.next() else {
+        return 0.0;
+    };
+    let off = |(a, b): (&Rigid, &Rigid)| {
+        let (a, b) = (first.0.inverse() * *a, first.1.inverse() * *b);
+        a.angle_to(&b)
+    };
+    both.map(off).fold(0.0, f64::max)
+}
+
+/// Of starts that say different things, those remain whose turns are the ones of odometry, if there are any.
+fn prefer_by_odometry(scene: &Reconstruction, found: &mut Vec<Candidate>) {
+    let agrees = |candidate: &Candidate| {
+        let misfit = turn_misfit(scene, &candidate.poses);
+        misfit.is_some_and(|misfit| misfit <= MAX_MISFIT)
+    };
+    if found.iter().any(agrees) {
+        found.retain(agrees);
+    }
+}
+
+fn poses_of(scene: &Reconstruction, submap: u32) -> BTreeMap<usize, Rigid> {
+    let views = scene.submaps[submap as usize].views.iter();
+    let pose = |&view: &usize| Some((view, world_from_cam(scene, view)?));
+    views.filter_map(pose).collect()
 }
 
 /// Two views to start from, and the motion between them that is tried.
@@ -119,7 +175,7 @@ struct FirstPair {
     score: f64,
     ends: (usize, usize),
     second_from_first: Rigid,
-    /// Homography, in pixels, of the plane that shows most of the matches, if it shows half of them.
+    /// Homography, in pixels, of the plane that shows most of the matches, if it shows many of them.
     plane: Option<DMat3>,
     /// The motion is in metres, by measured depth.
     is_metric: bool,
@@ -255,8 +311,9 @@ fn metric_pair(
 /// A submap that was started.
 struct Made {
     n_views: usize,
-    /// Matches that it explains.
+    /// Matches that it explains, and their share.
     n_explained: usize,
+    explained: f64,
 }
 
 /// The new submap, the last one; `None` and no submap where the scene does not hold.
@@ -308,6 +365,7 @@ fn attempt(
             return Some(Made {
                 n_views: n,
                 n_explained,
+                explained,
             });
         }
     }

@@ -3,6 +3,8 @@
 //! Only the motion between two keyframes counts, never where odometry says that they are: it drifts. Wheels slip, so its noise
 //! grows with the way and the turn, and a motion that is far off what the images show has little weight.
 
+use std::collections::BTreeMap;
+
 use glam::DQuat;
 
 use crate::length_ratio::{LogRatio, of_odometry};
@@ -25,6 +27,8 @@ const MAX_TURN_SPEED: f64 = 10.0;
 /// that this takes.
 pub(crate) const MAX_MISFIT: f64 = 3.0;
 const MIN_MOTIONS: usize = 4;
+/// The same of turns, between the views that a submap starts from.
+const MIN_TURNS: usize = 2;
 
 /// A motion between two keyframes in metres, and its standard deviations: along and about each axis.
 #[derive(Debug, Clone, Copy)]
@@ -158,5 +162,22 @@ pub(crate) fn misfit(scene: &Reconstruction, views: &[usize], unit: f64) -> Opti
     };
     let mut all: Vec<f64> = views.windows(2).filter_map(off).collect();
     let is_enough = all.len() >= MIN_MOTIONS;
+    median(&mut all).filter(|_| is_enough)
+}
+
+/// By how many standard deviations odometry disagrees with poses on the turns between views that follow one another, in the median;
+/// `None` of too few. It needs no unit.
+pub(crate) fn turn_misfit(
+    scene: &Reconstruction,
+    world_from_cam: &BTreeMap<usize, Rigid>,
+) -> Option<f64> {
+    let views: Vec<(&usize, &Rigid)> = world_from_cam.iter().collect();
+    let off = |two: &[(&usize, &Rigid)]| {
+        let own = motion(scene, *two[0].0, *two[1].0)?;
+        let seen = two[0].1.inverse() * *two[1].1;
+        Some(seen.angle_to(&own.first_from_second) / own.std[1] / 3.0_f64.sqrt())
+    };
+    let mut all: Vec<f64> = views.windows(2).filter_map(off).collect();
+    let is_enough = all.len() >= MIN_TURNS;
     median(&mut all).filter(|_| is_enough)
 }
