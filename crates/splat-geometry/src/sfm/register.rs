@@ -108,19 +108,17 @@ fn is_there(
     pairs: &[(u32, u32)],
     limits: &Limits,
 ) -> bool {
-    let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
-    for &(_, landmark) in pairs {
-        for &(other, _) in &scene.landmarks[landmark as usize].seen {
-            *counts.entry(other as usize).or_insert(0) += 1;
-        }
-    }
-    let n_near: usize = counts
-        .iter()
-        .filter(|(other, _)| other.abs_diff(view) <= NEAR_VIEWS)
-        .map(|(_, n)| *n)
-        .sum();
-    if n_near >= limits.min_inliers {
+    let seen = pairs.iter().flat_map(|&(_, landmark)| {
+        let seen = scene.landmarks[landmark as usize].seen.iter();
+        seen.map(|&(other, _)| other as usize)
+    });
+    let near = seen.clone().filter(|o| o.abs_diff(view) <= NEAR_VIEWS);
+    if near.take(limits.min_inliers).count() == limits.min_inliers {
         return true;
+    }
+    let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
+    for other in seen {
+        *counts.entry(other).or_insert(0) += 1;
     }
     let mut others: Vec<(usize, usize)> = counts.into_iter().map(|(o, n)| (n, o)).collect();
     others.sort_unstable_by(|a, b| b.cmp(a));

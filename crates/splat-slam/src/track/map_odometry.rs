@@ -128,6 +128,11 @@ impl MapOdometry {
         (!self.wheels.is_out()).then_some(&self.wheels)
     }
 
+    /// Whether the source has odometry.
+    pub(crate) fn has_source(&self) -> bool {
+        self.wheels.has_come()
+    }
+
     /// Whether odometry of the source disagrees with the camera and is left out.
     pub(crate) fn is_source_out(&self) -> bool {
         self.wheels.is_out()

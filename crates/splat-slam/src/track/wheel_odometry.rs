@@ -106,6 +106,10 @@ impl WheelOdometry {
         self.link.push(frame.seq, Some(pose));
     }
 
+    pub(crate) fn has_come(&self) -> bool {
+        self.last.is_some()
+    }
+
     /// Whether odometry has disagreed with what the map measured.
     pub(crate) fn is_out(&self) -> bool {
         self.check.is_out

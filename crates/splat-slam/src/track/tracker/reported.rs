@@ -47,10 +47,12 @@ impl Tracker {
             anchor,
             covariance,
         });
-        let (depth, keyframes) = (self.scene_depth(), &self.keyframes);
-        let measured = MeasuredFrame { seq, stamp, anchor };
-        self.odometry
-            .compare(measured, depth, |anchor| keyframes.pose_by(anchor));
+        if self.odometry.has_source() {
+            let (depth, keyframes) = (self.scene_depth(), &self.keyframes);
+            let measured = MeasuredFrame { seq, stamp, anchor };
+            self.odometry
+                .compare(measured, depth, |anchor| keyframes.pose_by(anchor));
+        }
         let points = found.points.as_deref().zip(self.odometry.newest());
         if let Some((points, frame)) = points {
             let points = points.iter().map(|p| (p.id, p.point_in_world, p.pixel));
