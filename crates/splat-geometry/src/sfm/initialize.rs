@@ -110,7 +110,7 @@ pub(crate) fn start(
     prefer_by_odometry(scene, &mut found);
     let best = found.iter().max_by_key(|candidate| candidate.n_explained);
     let again = best
-        .filter(|best| !found.iter().any(|other| other.rivals(best)))
+        .filter(|best| !found.iter().any(|other| other.contradicts(best)))
         .and_then(|best| attempt(scene, &waiting, &best.pair, min_views, limits));
     if again.is_some() {
         Start::Started
@@ -131,7 +131,7 @@ struct Candidate {
 
 impl Candidate {
     /// Whether this start explains about as much as the best one, and says something else.
-    fn rivals(&self, best: &Self) -> bool {
+    fn contradicts(&self, best: &Self) -> bool {
         let is_alike = self.n_explained as f64 > ALIKE * best.n_explained as f64;
         is_alike && turned_between(&self.poses, &best.poses) > SAME_TURN
     }
