@@ -1,7 +1,7 @@
 //! What a geometry model says of keyframes: cameras, depth and how far they can be trusted, in its own frame and scale.
 
 use splat_types::camera::{CameraModel, Intrinsics};
-use splat_types::covariance::Covariance;
+use splat_types::covariance::{Covariance, worst_std};
 use splat_types::depth::DepthMap;
 use splat_types::load_shed::LoadShed;
 use splat_types::snapshot::ScaleSource;
@@ -35,12 +35,8 @@ impl PoseQuality {
 
     /// Standard deviations of the pose along and about its least certain axes: (unit of the poses, degrees).
     pub fn std(&self) -> Option<(f64, f64)> {
-        let covariance = self.covariance?;
-        let worst = |axes: std::ops::Range<usize>| {
-            let variances = axes.map(|i| covariance[i][i]);
-            variances.fold(0.0, f64::max).sqrt()
-        };
-        Some((worst(0..3), worst(3..6).to_degrees()))
+        let (place, turn) = worst_std(&self.covariance?);
+        Some((place, turn.to_degrees()))
     }
 }
 

@@ -11,6 +11,8 @@ pub mod similarity;
 
 pub mod length_ratio;
 
+pub mod odometry_step;
+
 pub mod stats;
 
 pub mod shared_library;

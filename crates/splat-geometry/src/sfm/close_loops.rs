@@ -14,7 +14,7 @@ use crate::sfm::adjust::{adjust_global, adjust_local};
 use crate::sfm::landmarks::{extend, join};
 use crate::sfm::limits::Limits;
 use crate::sfm::merge_submaps::{similarity, views_in_common};
-use crate::sfm::odometry::std_between;
+use crate::sfm::odometry::{metres_per_unit, motion};
 use crate::sfm::overlap::overlap;
 use crate::sfm::pairwise::{pair_seed, release};
 use crate::sfm::reconstruction::{
@@ -258,12 +258,11 @@ fn bend(scene: &mut Reconstruction, submap: u32, links: &[&Candidate]) -> bool {
     let depths: Vec<f64> = views.iter().map(|s| depth(scene, *s)).collect();
     let way: Vec<usize> = (0..views.len()).collect();
     let mut edges = Edge::along(&way, &before, |ix| depths[ix]);
-    for edge in &mut edges {
-        loosen(
-            scene,
-            edge,
-            (submap, [views[edge.first], views[edge.second]]),
-        );
+    if let Some(scale) = metres_per_unit(scene, submap) {
+        for edge in &mut edges {
+            let ends = [views[edge.first], views[edge.second]];
+            loosen(scene, edge, (ends, scale.log.exp()));
+        }
     }
     let ix = |(a, b): (usize, usize)| Some((*ix_of.get(&a)?, *ix_of.get(&b)?));
     let closed = scene.closed.iter().filter_map(|ends| ix(*ends));
@@ -304,15 +303,14 @@ fn bend(scene: &mut Reconstruction, submap: u32, links: &[&Candidate]) -> bool {
     true
 }
 
-/// Where odometry alone ties two views, the edge between them is as stiff as odometry is sure.
-fn loosen(scene: &Reconstruction, edge: &mut Edge, (submap, ends): (u32, [usize; 2])) {
-    let has_odometry = scene.views[ends[0]].keyframe.frame.odometry.is_some();
-    if !has_odometry || scene.shared_counts(ends[0]).contains_key(&ends[1]) {
+/// Where odometry alone ties two views, the edge between them is as stiff as odometry is sure; the submap's unit is in metres.
+fn loosen(scene: &Reconstruction, edge: &mut Edge, (ends, unit): ([usize; 2], f64)) {
+    let Some(motion) = motion(scene, ends[0], ends[1]) else {
         return;
-    }
-    if let Some([place, turn]) = std_between(scene, submap, ends[0], ends[1]) {
-        edge.std[0] = edge.std[0].max(place);
-        edge.std[1] = edge.std[1].max(turn);
+    };
+    if !scene.shared_counts(ends[0]).contains_key(&ends[1]) {
+        edge.std[0] = edge.std[0].max(motion.std[0] / unit);
+        edge.std[1] = edge.std[1].max(motion.std[1]);
     }
 }
 

@@ -28,7 +28,7 @@ const MUCH_PARALLAX_DEG: f64 = 100.0;
 /// Share of matches on one plane from which on a pair is a poor start: two motions explain it about equally well.
 const PLANE_SHARE: f64 = 0.85;
 /// Share from which on both motions are tried: the one that five points gave may be the plane's wrong one.
-const HALF_PLANE_SHARE: f64 = 0.35;
+const BOTH_MOTIONS_SHARE: f64 = 0.35;
 
 /// A start that places this share of the waiting views is taken without trying other pairs.
 const GOOD_SHARE: f64 = 0.7;
@@ -80,7 +80,7 @@ pub(crate) fn start(
             Start::NoMatches
         };
     }
-    let mut found: Vec<Candidate> = Vec::new();
+    let (mut found, mut is_enough) = (Vec::<Candidate>::new(), false);
     for pair in pairs.into_iter().take(MAX_ATTEMPTS) {
         let other = pair.other_motion(scene);
         for pair in [Some(pair), other].into_iter().flatten() {
@@ -96,14 +96,15 @@ pub(crate) fn start(
             let last = scene.submaps.len() as u32 - 1;
             let poses = poses_of(scene, last);
             scene.dissolve(last);
+            // No other pair needs to be tried.
+            is_enough |= is_good && is_clear;
             found.push(Candidate {
                 pair,
                 n_explained: made.n_explained,
-                is_enough: is_good && is_clear,
                 poses,
             });
         }
-        if found.iter().any(|candidate| candidate.is_enough) {
+        if is_enough {
             break;
         }
     }
@@ -123,8 +124,6 @@ pub(crate) fn start(
 struct Candidate {
     pair: FirstPair,
     n_explained: usize,
-    /// No other pair needs to be tried.
-    is_enough: bool,
     /// `world_from_cam` by view.
     poses: BTreeMap<usize, Rigid>,
 }
@@ -263,7 +262,7 @@ fn ranked_pairs(
             ends: (a, b),
             second_from_first: pose,
             plane: on_plane
-                .filter(|_| share > HALF_PLANE_SHARE)
+                .filter(|_| share > BOTH_MOTIONS_SHARE)
                 .map(|found| found.0),
             is_metric: false,
         });

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use glam::DQuat;
 
 use crate::length_ratio::{LogRatio, of_odometry};
+use crate::odometry_step::is_continuous;
 use crate::optim::bundle::problem::RelativeMotion;
 use crate::sfm::reconstruction::{OdometryNoise, Reconstruction};
 use crate::stats::median;
@@ -20,9 +21,6 @@ const LEAST: f64 = 0.001;
 const LEAST_TURN: f64 = 0.001;
 /// Of a turn, so large a share is wrong.
 const TURN_SHARE: f64 = 0.02;
-/// Faster than that, in metres and radians per second, odometry has begun anew.
-const MAX_SPEED: f64 = 40.0;
-const MAX_TURN_SPEED: f64 = 10.0;
 /// Odometry that is off by so many standard deviations, in the median over the motions beside a gap, joins nothing across it; and the motions
 /// that this takes.
 pub(crate) const MAX_MISFIT: f64 = 3.0;
@@ -35,6 +33,19 @@ const MIN_TURNS: usize = 2;
 pub(crate) struct OdometryMotion {
     pub(crate) first_from_second: Rigid,
     pub(crate) std: [f64; 2],
+}
+
+impl OdometryMotion {
+    /// By how many standard deviations the turn between the images is another one, on average over three axes.
+    fn turn_misfit(&self, seen: &Rigid) -> f64 {
+        seen.angle_to(&self.first_from_second) / self.std[1] / 3.0_f64.sqrt()
+    }
+
+    /// The same of the place, whose unit is so many metres.
+    fn place_misfit(&self, seen: &Rigid, unit: f64) -> f64 {
+        let off = (seen.translation * unit).distance(self.first_from_second.translation);
+        off / self.std[0] / 3.0_f64.sqrt()
+    }
 }
 
 impl OdometryNoise {
@@ -66,10 +77,8 @@ pub(crate) fn motion(
     }
     let [a, b] = [first, second].map(|ix| &scene.views[ix].keyframe.frame);
     let first_from_second = a.odometry?.inverse() * b.odometry?;
-    let secs = b.stamp.secs_since(a.stamp).abs().max(0.02);
-    let is_one_way = first_from_second.translation.length() <= MAX_SPEED * secs
-        && (first_from_second.rotation.angle_between(DQuat::IDENTITY) <= MAX_TURN_SPEED * secs);
-    is_one_way.then(|| OdometryMotion {
+    let secs = b.stamp.secs_since(a.stamp);
+    is_continuous(&first_from_second, secs).then(|| OdometryMotion {
         first_from_second,
         std: scene.odometry_noise.std(&first_from_second),
     })
@@ -136,29 +145,13 @@ pub(crate) fn motions(
     motions.collect()
 }
 
-/// Standard deviations of what odometry says of the motion between two views of a submap, in its unit and in radians.
-pub(crate) fn std_between(
-    scene: &Reconstruction,
-    submap: u32,
-    first: usize,
-    second: usize,
-) -> Option<[f64; 2]> {
-    let unit = metres_per_unit(scene, submap)?.log.exp();
-    let [place, turn] = motion(scene, first, second)?.std;
-    Some([place / unit, turn])
-}
-
 /// By how many standard deviations odometry and the images disagree on the motions between views that follow one another, in the
 /// median; `None` of too few. `unit` is in metres.
 pub(crate) fn misfit(scene: &Reconstruction, views: &[usize], unit: f64) -> Option<f64> {
     let off = |two: &[usize]| {
         let own = motion(scene, two[0], two[1])?;
         let seen = world_from_cam(scene, two[0])?.inverse() * world_from_cam(scene, two[1])?;
-        let shift = (seen.translation * unit).distance(own.first_from_second.translation);
-        let turn = seen.angle_to(&own.first_from_second);
-        // Over three axes each.
-        let root = 3.0_f64.sqrt();
-        Some((shift / own.std[0]).max(turn / own.std[1]) / root)
+        Some(own.place_misfit(&seen, unit).max(own.turn_misfit(&seen)))
     };
     let mut all: Vec<f64> = views.windows(2).filter_map(off).collect();
     let is_enough = all.len() >= MIN_MOTIONS;
@@ -175,7 +168,7 @@ pub(crate) fn turn_misfit(
     let off = |two: &[(&usize, &Rigid)]| {
         let own = motion(scene, *two[0].0, *two[1].0)?;
         let seen = two[0].1.inverse() * *two[1].1;
-        Some(seen.angle_to(&own.first_from_second) / own.std[1] / 3.0_f64.sqrt())
+        Some(own.turn_misfit(&seen))
     };
     let mut all: Vec<f64> = views.windows(2).filter_map(off).collect();
     let is_enough = all.len() >= MIN_TURNS;

@@ -3,6 +3,7 @@
 use crate::track::anchor::Anchor;
 use crate::track::map_odometry::MapInitialisation;
 use crate::track::odometry_link::MIN_UNIT_STD;
+use splat_types::covariance::worst_std;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame};
 use splat_types::transform::Rigid;
@@ -78,11 +79,8 @@ impl History {
         self.n_frames += 1;
         self.n_tracked += u64::from(frame.is_measured());
         let std = frame.pose.map(|pose| {
-            let worst = |axes: std::ops::Range<usize>| {
-                let variances = axes.map(|i| pose.covariance[i][i]);
-                variances.fold(0.0, f64::max).sqrt()
-            };
-            (worst(0..3) as f32, worst(3..6).to_degrees() as f32)
+            let (place, turn) = worst_std(&pose.covariance);
+            (place as f32, turn.to_degrees() as f32)
         });
         let measured = frame.pose.filter(|pose| !pose.is_predicted);
         let track = FrameTrack {

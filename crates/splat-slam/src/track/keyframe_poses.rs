@@ -40,6 +40,11 @@ impl KeyframePoses {
         self.poses.get(id)
     }
 
+    /// Of a keyframe's depths; 1 where the map has it no more.
+    pub(crate) fn unit(&self, id: u32) -> f64 {
+        self.get(&id).map_or(1.0, |(_, unit)| *unit)
+    }
+
     /// `world_from_cam` of a frame by the keyframe's pose of this moment; `None` where the map has it no more.
     pub(crate) fn pose_by(&self, anchor: &Anchor) -> Option<Rigid> {
         let (world_from_key, unit) = self.get(&anchor.keyframe_id)?;

@@ -450,7 +450,7 @@ impl Tracker {
             Some(Anchor {
                 keyframe_id: id,
                 key_from_cam: Rigid::IDENTITY,
-                unit: self.keyframes.get(&id).map_or(1.0, |(_, unit)| *unit),
+                unit: self.keyframes.unit(id),
             })
         } else if let Some(seen) = &waiting.seen {
             let guess = frame.anchor.and_then(|anchor| self.pose_by(&anchor));
@@ -471,7 +471,7 @@ impl Tracker {
         Some(Anchor {
             keyframe_id,
             key_from_cam,
-            unit: self.keyframes.get(&keyframe_id).map_or(1.0, |k| k.1),
+            unit: self.keyframes.unit(keyframe_id),
         })
     }
 

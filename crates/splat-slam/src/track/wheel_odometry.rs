@@ -8,14 +8,10 @@ use std::collections::VecDeque;
 use crate::track::anchor::Anchor;
 use crate::track::odometry_link::{LinkedMotion, OdometryLink};
 use crate::visual_odometry::odometry::OdometryPose;
+use splat_geometry::odometry_step::is_continuous;
 use splat_types::frame::Frame;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
-
-/// Faster than that, in metres and radians per second, odometry has begun anew: a driver that was started again.
-const MAX_SPEED: f64 = 40.0;
-const MAX_TURN_SPEED: f64 = 10.0;
-const MIN_SECS: f64 = 0.02;
 
 /// Motions over so many seconds are compared, and at most over so many.
 const COMPARED_SECS: f64 = 0.5;
@@ -89,9 +85,7 @@ impl WheelOdometry {
         };
         if let Some((stamp, before)) = &self.last {
             let step = before.inverse() * odometry_from_cam;
-            let secs = frame.stamp.secs_since(*stamp).abs().max(MIN_SECS);
-            let turn = step.angle_to(&Rigid::IDENTITY);
-            if step.translation.length() > MAX_SPEED * secs || turn > MAX_TURN_SPEED * secs {
+            if !is_continuous(&step, frame.stamp.secs_since(*stamp)) {
                 self.segment += 1;
             }
         }

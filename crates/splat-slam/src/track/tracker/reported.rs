@@ -12,6 +12,7 @@ use crate::track::observation::Observation;
 use crate::track::odometry_link::LinkedPose;
 use crate::track::wheel_odometry::MeasuredFrame;
 use crate::visual_odometry::odometry::OdometryPose;
+use splat_types::covariance::worst_std;
 use splat_types::time::Stamp;
 use splat_types::tracking::{LostReason, TrackState, TrackedFrame, TrackedPose};
 use splat_types::transform::Rigid;
@@ -99,8 +100,7 @@ impl Tracker {
     ) -> TrackedFrame {
         self.odometry.registered_in_map();
         let is_new = self.state == TrackState::Lost;
-        let unit = self.keyframes.get(&linked.keyframe_id);
-        let anchor = linked.anchor(unit.map_or(1.0, |(_, unit)| *unit));
+        let anchor = linked.anchor(self.keyframes.unit(linked.keyframe_id));
         let pose = (
             world_from_cam.inverse(),
             linked.covariance,
@@ -118,12 +118,9 @@ impl Tracker {
         reason: LostReason,
         (linked, world_from_cam): &(LinkedPose, Rigid),
     ) -> TrackedFrame {
-        let worst = |axes: std::ops::Range<usize>| {
-            let variances = axes.map(|i| linked.covariance[(i, i)]);
-            variances.fold(0.0, f64::max).sqrt()
-        };
-        let is_sure = worst(0..3) < MAX_BRIDGED_STD * self.scene_depth()
-            && worst(3..6) < MAX_BRIDGED_TURN_STD;
+        let covariance = rows(&linked.covariance);
+        let (place, turn) = worst_std(&covariance);
+        let is_sure = place < MAX_BRIDGED_STD * self.scene_depth() && turn < MAX_BRIDGED_TURN_STD;
         if !is_sure || matches!(self.state, TrackState::Initialising | TrackState::Lost) {
             let tracked = self.missed(at, reason);
             self.keep(seen, &tracked, None);
@@ -138,14 +135,13 @@ impl Tracker {
             reason: Some(reason),
             pose: Some(TrackedPose {
                 world_from_cam: *world_from_cam,
-                covariance: rows(&linked.covariance),
+                covariance,
                 is_predicted: true,
             }),
             n_inliers: 0,
         };
         self.keep(seen, &tracked, None);
-        let unit = self.keyframes.get(&linked.keyframe_id);
-        let anchor = linked.anchor(unit.map_or(1.0, |(_, unit)| *unit));
+        let anchor = linked.anchor(self.keyframes.unit(linked.keyframe_id));
         if let Some(entry) = self.history.frames.last_mut() {
             entry.anchor = Some(anchor);
         }
