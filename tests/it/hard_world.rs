@@ -108,6 +108,7 @@ pub(crate) fn film(solids: &[Solid], poses: &[Rigid], flaws: Flaws, lens: Intrin
             intrinsics: Some(lens),
             truth: None,
             odometry: None,
+            imu: None,
             sensor_depth: None,
             second: None,
             is_held_out: false,

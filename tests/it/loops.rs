@@ -65,6 +65,7 @@ pub(crate) fn film(scene: &str, stride: u32) -> Filmed {
             intrinsics: Some(lens),
             truth: None,
             odometry: None,
+            imu: None,
             sensor_depth: None,
             second: None,
             is_held_out: false,

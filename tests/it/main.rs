@@ -35,6 +35,7 @@ mod hostile_scenes;
 mod house;
 mod html;
 mod images;
+mod imu;
 mod joint;
 mod layers;
 mod lenses;

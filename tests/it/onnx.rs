@@ -273,6 +273,7 @@ fn batch(id: u32, levels: &[u8]) -> Batch {
             intrinsics: None,
             truth: None,
             odometry: None,
+            imu: None,
             sensor_depth: None,
             second: None,
             is_held_out: false,

@@ -105,6 +105,7 @@ pub(crate) fn keyframe(
         intrinsics: calibrated.then(|| lens.resized(w, h)),
         truth: None,
         odometry: None,
+        imu: None,
         sensor_depth: None,
         second: None,
         is_held_out: false,

@@ -80,6 +80,7 @@ fn frames(settings: SynthSettings, numbers: Range<u32>) -> Vec<Frame> {
         intrinsics: Some(take.settings().lens().intrinsics),
         truth: Some(take.pose(ix)),
         odometry: None,
+        imu: None,
         sensor_depth: None,
         second: None,
         is_held_out: false,

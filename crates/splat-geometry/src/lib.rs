@@ -15,6 +15,8 @@ pub mod odometry_step;
 
 pub mod stats;
 
+pub mod inertial;
+
 pub mod shared_library;
 
 pub mod inference;

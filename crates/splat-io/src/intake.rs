@@ -14,6 +14,7 @@ use splat_types::camera::{CameraModel, Distortion, Intrinsics};
 use splat_types::depth::DepthMap;
 use splat_types::frame::{Frame, SecondImage};
 use splat_types::image::{Filter, Resampler, RgbImage};
+use splat_types::inertial::ImuSpan;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
@@ -22,6 +23,7 @@ use splat_types::transform::Rigid;
 pub struct Extras {
     pub truth: Option<Rigid>,
     pub odometry: Option<Rigid>,
+    pub imu: Option<ImuSpan>,
     pub sensor_depth: Option<DepthMap>,
     pub second: Option<SecondImage>,
     /// This image's own lens, where the images of an input differ; their sizes may then differ, too.
@@ -220,6 +222,7 @@ impl Intake {
             intrinsics: working.intrinsics,
             truth: extras.truth,
             odometry: extras.odometry,
+            imu: extras.imu,
             sensor_depth,
             second: extras.second.map(Arc::new),
             is_held_out: extras.is_held_out,

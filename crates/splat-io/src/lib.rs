@@ -46,6 +46,8 @@ pub mod depth_registration;
 
 pub mod second_camera;
 
+pub mod imu;
+
 pub mod topics;
 
 pub mod mcap;

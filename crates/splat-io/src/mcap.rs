@@ -11,14 +11,15 @@ use crate::depth_registration::{Calibrated, Registration, registration};
 use crate::error::SourceError;
 use crate::frame_source::{MetricInput, Source, SourceCounts};
 use crate::ground_truth::{GroundTruth, Odometry, half_interval};
+use crate::imu::ImuBuffer;
 use crate::intake::{Arrival, Extras, Intake};
 use crate::params::SourceParams;
 use crate::ros_image::decode_into;
 use crate::second_camera::SecondCamera;
 use crate::survey::{Survey, header_stamp};
 use crate::topics::{
-    depth_topic_of, image_topic_of, info_beside, info_topic_of, lens_of, odometry_of,
-    second_topic_of, truth_of,
+    ImuTopic, depth_topic_of, image_topic_of, imu_topic_of, info_beside, info_topic_of, lens_of,
+    odometry_of, second_topic_of, truth_of,
 };
 use splat_image::jpeg::decoder::Jpeg;
 use splat_msgs::ros::{self, CompressedImage, Image};
@@ -46,6 +47,7 @@ struct ImageTopics {
     is_compressed: bool,
     depth: Option<DepthTopic>,
     second: Option<PairedTopic>,
+    imu: Option<ImuTopic>,
 }
 
 #[derive(Debug)]
@@ -105,6 +107,7 @@ struct Queues {
     depths: VecDeque<Waiting>,
     /// Of the second camera.
     seconds: VecDeque<Waiting>,
+    imu: ImuBuffer,
 }
 
 #[derive(Debug)]
@@ -155,6 +158,16 @@ impl McapSource {
                 topic.is_compressed,
             ),
         });
+        let imu =
+            imu_topic_of(&survey, &image_topic, params).map_err(|reason| SourceError::Open {
+                what: "IMU of the recording",
+                reason,
+                way_out: "mend source.imu_extrinsic, or leave it empty",
+                path: path.to_owned(),
+            })?;
+        if let Some(imu) = &imu {
+            tracing::info!(topic = imu.name, "IMU");
+        }
         let lens = match camera_info::of_url(&params.camera_info_url)? {
             Some((_, lens)) => Some(lens),
             None => lens_of(&survey, &image_topic, params),
@@ -178,6 +191,7 @@ impl McapSource {
                 is_compressed,
                 depth: depth_topic,
                 second,
+                imu,
             },
             max_frames: params.max_frames,
             queues: Queues::default(),
@@ -202,6 +216,13 @@ impl McapSource {
             }
         };
         let topic = &message.channel.topic;
+        if self.topics.imu.as_ref().is_some_and(|i| i.name == *topic) {
+            if let Err(reason) = self.queues.imu.push(message.payload) {
+                let text = format!("samples of the IMU are left out: {reason}");
+                self.intake.warn_once("imu", &text);
+            }
+            return;
+        }
         let is_depth = self.topics.depth.as_ref().is_some_and(|d| d.name == *topic);
         let is_second = self
             .topics
@@ -235,9 +256,10 @@ impl McapSource {
         let newest = |beside: &VecDeque<Waiting>| beside.iter().filter_map(|w| w.stamp).max();
         let has_depth = self.topics.depth.is_none() || newest(&queues.depths) >= stamp;
         let has_second = self.topics.second.is_none() || newest(&queues.seconds) >= stamp;
+        let has_imu = self.topics.imu.is_none() || queues.imu.newest() >= stamp;
         let is_ready = self.is_read
             || stamp.is_none()
-            || (has_depth && has_second)
+            || (has_depth && has_second && has_imu)
             || queues.images.len() > MAX_AHEAD
             || bytes_of(&queues.images) > MAX_AHEAD_BYTES;
         if is_ready {
@@ -273,12 +295,18 @@ impl McapSource {
         let truth = self.truth.at(arrival.stamp, self.truth_within_nanos);
         let sensor_depth = self.depth_at(arrival.stamp);
         let second = self.second_at(arrival.stamp);
+        let imu = self.topics.imu.as_ref();
+        let imu = imu.and_then(|topic| {
+            let waiting = &mut self.queues.imu;
+            waiting.take_until(arrival.stamp, &topic.cam_from_imu)
+        });
         self.intake.frame(
             arrival,
             image,
             Extras {
                 truth,
                 odometry: self.odometry.at(arrival.stamp),
+                imu,
                 sensor_depth,
                 second,
                 ..Extras::default()

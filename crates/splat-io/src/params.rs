@@ -32,6 +32,11 @@ pub struct SourceParams {
     pub stereo_tolerance: f64,
     /// nav_msgs/Odometry; empty takes the first there is, else tf from the frame odom to the camera.
     pub odometry_topic: String,
+    /// sensor_msgs/Imu, 100 to 1000 Hz; of a recording, empty takes the first found that /tf_static leads to from the camera.
+    pub imu_topic: String,
+    /// Where the IMU sits where no transform says: "x y z qx qy qz qw" in the camera's axes (x right, y down, z forward),
+    /// metres and a quaternion.
+    pub imu_extrinsic: String,
     /// Images of a folder or scene to use: beginnings of their file names, separated by commas; empty = all.
     pub include_prefixes: String,
     /// Of those, the images that are kept out of optimisation to measure quality, besides map.holdout: beginnings
@@ -68,6 +73,8 @@ impl Default for SourceParams {
             second_camera_info_topic: String::new(),
             stereo_tolerance: 0.003,
             odometry_topic: String::new(),
+            imu_topic: String::new(),
+            imu_extrinsic: String::new(),
             include_prefixes: String::new(),
             holdout_prefixes: String::new(),
             subsample: 0,

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use crate::bag::{Bag, Message};
 use crate::calibration::lens_of_camera_info;
 use crate::ground_truth::{Track, Transforms};
+use splat_msgs::ros::imu::Imu;
 use splat_msgs::ros::odometry::Odometry;
 use splat_msgs::ros::{
     self, CameraInfo, CompressedImage, Image, Message as _, PoseStamped, TfMessage,
@@ -140,6 +141,11 @@ impl Survey {
                 self.has_left_out |= !track.insert(pose.header.stamp.into(), gt_from_cam);
             }
             Odometry::TYPE_NAME => self.note_odometry(message),
+            Imu::TYPE_NAME if topic.frame_id.is_empty() => {
+                if let Ok(imu) = ros::decode::<Imu>(message.payload) {
+                    topic.frame_id = imu.header.frame_id;
+                }
+            }
             TfMessage::TYPE_NAME => {
                 if let Ok(transforms) = ros::decode::<TfMessage>(message.payload) {
                     let is_static = channel.topic.ends_with("tf_static");

@@ -6,9 +6,12 @@ use std::sync::Arc;
 use crate::calibration::{is_rectified, lens_of_camera_info};
 use crate::error::SourceError;
 use crate::ground_truth::{GroundTruth, Odometry};
+use crate::imu::extrinsic_of;
 use crate::params::SourceParams;
 use crate::second_camera::{OfPair, mounted, partner_of};
 use crate::survey::{Survey, Topic};
+use splat_msgs::ros::Message as _;
+use splat_msgs::ros::imu::Imu;
 use splat_types::camera::CameraModel;
 use splat_types::transform::Rigid;
 
@@ -228,6 +231,54 @@ pub(crate) fn odometry_of(
         };
     }
     Odometry::None
+}
+
+/// The topic of an IMU, and how it is mounted.
+#[derive(Debug)]
+pub(crate) struct ImuTopic {
+    pub(crate) name: String,
+    pub(crate) cam_from_imu: Rigid,
+}
+
+/// The IMU that the parameters name, else the first one whose place beside the camera is known; `None`, and a warning, where there
+/// are some and of none it is.
+pub(crate) fn imu_topic_of(
+    survey: &Survey,
+    image_topic: &str,
+    params: &SourceParams,
+) -> Result<Option<ImuTopic>, String> {
+    let by_params = extrinsic_of(params)?;
+    let camera = survey.topics.get(image_topic).map_or("", |t| &t.frame_id);
+    let is_imu = |topic: &Topic| topic.is_cdr() && topic.type_name == Imu::TYPE_NAME;
+    let all = survey.topics.iter().filter(|(_, topic)| is_imu(topic));
+    let wanted = &params.imu_topic;
+    let candidates: Vec<_> = all
+        .filter(|(name, _)| wanted.is_empty() || *name == wanted)
+        .collect();
+    let mounted = candidates.iter().find_map(|(name, topic)| {
+        let is_named = !camera.is_empty() && !topic.frame_id.is_empty();
+        let by_tf = survey.transforms.between(camera, &topic.frame_id);
+        let by_tf = by_tf.filter(|_| is_named);
+        let cam_from_imu = by_tf.or(by_params)?;
+        Some(ImuTopic {
+            name: (*name).clone(),
+            cam_from_imu,
+        })
+    });
+    if mounted.is_none() {
+        if let Some((name, topic)) = candidates.first() {
+            tracing::warn!(
+                "the IMU on {name:?} is left out: /tf_static does not lead from the camera {camera:?} to its frame {:?}; source.imu_extrinsic says it, too",
+                topic.frame_id
+            );
+        } else if !wanted.is_empty() {
+            tracing::warn!(
+                "no sensor_msgs/msg/Imu on topic {wanted:?}; found {}",
+                survey.listing()
+            );
+        }
+    }
+    Ok(mounted)
 }
 
 pub(crate) fn truth_of(

@@ -5,6 +5,8 @@
 
 pub mod odometry;
 
+pub mod imu;
+
 mod rigid;
 
 pub mod standard;

@@ -158,6 +158,7 @@ impl Source for EndlessSource {
             intrinsics: Some(self.lens),
             truth: Some(pose),
             odometry: None,
+            imu: None,
             sensor_depth: Some(Arc::new(depth)),
             second: None,
             is_held_out: false,

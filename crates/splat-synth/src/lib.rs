@@ -62,6 +62,8 @@ pub mod take;
 
 mod odometry;
 
+pub mod imu;
+
 pub mod record;
 
 pub mod layouts;

@@ -46,6 +46,7 @@ impl SynthSettings {
                 "rate" => self.rate = Some(number),
                 "speed" => self.speed = number,
                 "odometry" => self.odometry = Some(number),
+                "imu" => self.imu = Some(number),
                 "slip" => self.slip = number,
                 "blackout" => self.blackout = number,
                 "shake" => self.shake = number,
@@ -96,6 +97,7 @@ impl SynthSettings {
                 "rate" => self.rate.unwrap_or(RATE),
                 "speed" => self.speed,
                 "odometry" => self.odometry.unwrap_or(0.0),
+                "imu" => self.imu.unwrap_or(0.0),
                 "slip" => self.slip,
                 "blackout" => self.blackout,
                 "shake" => self.shake,
@@ -153,7 +155,7 @@ impl Range {
     }
 }
 
-const RANGES: [Range; 15] = [
+const RANGES: [Range; 16] = [
     Range::new(
         "frames",
         [1.0, 100_000.0],
@@ -178,6 +180,7 @@ const RANGES: [Range; 15] = [
     Range::new("blur", [0.0, 1.0], false, "a share in [0, 1]"),
     Range::new("movers", [0.0, 100.0], true, "a whole number in [0, 100]"),
     Range::new("odometry", [0.0, 1.0], false, "a share in [0, 1]"),
+    Range::new("imu", [0.0, 100.0], false, "a number in [0, 100]"),
     Range::new("slip", [-1.0, 1.0], false, "a share in [-1, 1]"),
     Range::new("blackout", [0.0, 600.0], false, "seconds in [0, 600]"),
     Range::new("shake", [0.0, 20.0], false, "a number in [0, 20]"),

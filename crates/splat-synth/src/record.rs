@@ -11,11 +11,13 @@ use std::path::Path;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 
+use crate::imu::{self, ImuTake};
 use crate::odometry;
 use crate::settings::{SynthError, SynthSettings};
 use crate::take::Take;
 use splat_io::bag_writer::{BagWriter, Topic, camera_info, options};
 use splat_io::whole_file::write_file;
+use splat_msgs::ros::imu::Imu;
 use splat_msgs::ros::odometry::Odometry;
 use splat_msgs::ros::{
     CameraInfo, CompressedImage, Header, Image, Pose, PoseStamped, TfMessage, TransformStamped,
@@ -28,6 +30,7 @@ const WORLD: &str = "map";
 const CAMERA: &str = "camera_optical";
 const BASE: &str = "base_link";
 const ODOM: &str = "odom";
+const IMU: &str = "imu_link";
 
 /// Depth images have one pixel for so many of the colour image, along each side.
 const DEPTH_DIVISOR: u32 = 5;
@@ -110,6 +113,7 @@ fn record(
     let mut calibration = out.topic::<CameraInfo>("/camera/camera_info")?;
     let mut tf = out.topic::<TfMessage>("/tf")?;
     let mut wheels = Wheels::new(take, &mut out)?;
+    let mut inertial = Inertial::new(take, &mut out)?;
     let mut poses = out.topic::<PoseStamped>("/ground_truth/pose")?;
     let mut depths = if take.settings().depth {
         Some(out.topic::<Image>("/camera/depth")?)
@@ -133,6 +137,9 @@ fn record(
             // A frame has one parent: with wheels it is the base.
             let message = transform(header(WORLD), CAMERA, pose);
             out.write(&mut tf, nanos, &message)?;
+        }
+        if let Some(inertial) = &mut inertial {
+            inertial.write(&mut out, ix)?;
         }
         out.write(
             &mut poses,
@@ -160,6 +167,56 @@ fn record(
     let n_messages = out.n_messages;
     out.finish()?;
     Ok(n_messages)
+}
+
+/// Samples of the IMU on their way into a file.
+struct Inertial<'a> {
+    take: &'a Take,
+    samples: ImuTake<'a>,
+    imu: Topic,
+    mounted: Topic,
+}
+
+impl<'a> Inertial<'a> {
+    fn new<W: Write + Seek>(
+        take: &'a Take,
+        out: &mut BagWriter<W>,
+    ) -> Result<Option<Self>, String> {
+        let Some(samples) = ImuTake::new(take) else {
+            return Ok(None);
+        };
+        Ok(Some(Self {
+            take,
+            samples,
+            imu: out.topic::<Imu>("/imu/data_raw")?,
+            mounted: out.topic::<TfMessage>("/tf_static")?,
+        }))
+    }
+
+    fn write<W: Write + Seek>(&mut self, out: &mut BagWriter<W>, ix: u32) -> Result<(), String> {
+        if ix == 0 {
+            let stamp = self.take.stamp(0);
+            let header = Header {
+                stamp: stamp.into(),
+                frame_id: CAMERA.to_owned(),
+            };
+            let message = transform(header, IMU, imu::cam_from_imu().into());
+            out.write(&mut self.mounted, stamp.nanos.unsigned_abs(), &message)?;
+        }
+        for sample in self.samples.until(self.take.stamp(ix)) {
+            let mut message = Imu {
+                angular_velocity: sample.angular_velocity.into(),
+                linear_acceleration: sample.acceleration.into(),
+                ..Imu::default()
+            };
+            message.header.stamp = sample.stamp.into();
+            message.header.frame_id = IMU.to_owned();
+            // It measures no orientation.
+            message.orientation_covariance[0] = -1.0;
+            out.write(&mut self.imu, sample.stamp.nanos.unsigned_abs(), &message)?;
+        }
+        Ok(())
+    }
 }
 
 /// Odometry on its way into a file.

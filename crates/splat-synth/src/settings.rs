@@ -16,7 +16,7 @@ pub enum SynthError {
     #[error("{found:?} is no lens, expected pinhole, radial or fisheye")]
     Lens { found: String },
     #[error(
-        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, movers, rate, speed, seed, quality, depth, odometry, slip, blackout, shake"
+        "unknown option {key:?} of a synthetic scene, expected one of frames, width, height, fov, lens, noise, exposure, blur, movers, rate, speed, seed, quality, depth, odometry, imu, slip, blackout, shake"
     )]
     Option { key: String },
     #[error("option {key} of a synthetic scene = {found}, expected {expected}")]
@@ -85,6 +85,8 @@ pub struct SynthSettings {
     pub depth: bool,
     /// Share by which each step of the odometry is wrong (a standard deviation); `None`: there is none.
     pub odometry: Option<f64>,
+    /// Noise of an IMU at 200 Hz, as a multiple of that of a MEMS sensor (`imu`); `None`: there is none.
+    pub imu: Option<f64>,
     /// Wheels that slip for two seconds, a third of the way in: their steps are too long by that share.
     pub slip: f64,
     /// Seconds in the middle in which the camera sees nothing.
@@ -113,6 +115,7 @@ impl SynthSettings {
             jpeg_quality: 85,
             depth: true,
             odometry: None,
+            imu: None,
             slip: 0.0,
             blackout: 0.0,
             shake: 1.0,

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use crate::imu;
 use crate::odometry;
 use crate::settings::{SynthError, SynthSettings};
 use crate::take::Take;
@@ -13,6 +14,7 @@ use splat_io::pace::Pace;
 use splat_io::params::SourceParams;
 use splat_types::camera::Intrinsics;
 use splat_types::frame::Frame;
+use splat_types::inertial::ImuSpan;
 use splat_types::transform::{Rigid, extent};
 
 /// Films on demand: each `next` renders one frame. Live, one with a rate of its own hands them out at that rate.
@@ -23,6 +25,8 @@ pub struct SyntheticSource {
     next_ix: u32,
     /// `odom_from_cam` of every frame, if there is odometry.
     odometry: Vec<Rigid>,
+    /// Of every frame, if there is an IMU.
+    imu: Vec<ImuSpan>,
     /// Undistorts the images of distorted lenses.
     rectifier: Option<Undistorter>,
     pace: Pace,
@@ -68,6 +72,7 @@ impl SyntheticSource {
         let track = noise.map_or_else(Vec::new, |noise| odometry::track(&take, noise));
         let mounted = odometry::base_from_cam();
         Ok(Self {
+            imu: imu::spans(&take),
             odometry: track.into_iter().map(|base| base * mounted).collect(),
             take,
             n_frames,
@@ -107,6 +112,7 @@ impl Source for SyntheticSource {
             intrinsics,
             truth: Some(self.take.pose(ix)),
             odometry: self.odometry.get(ix as usize).copied(),
+            imu: self.imu.get(ix as usize).cloned(),
             sensor_depth,
             second: None,
             is_held_out: false,

@@ -86,7 +86,12 @@ impl Take {
 
     /// Pose a share of the frame interval before or after the middle of an exposure.
     fn pose_beside(&self, ix: u32, share: f64) -> Rigid {
-        let secs = self.tenths(f64::from(ix) + share) * 1e8 * 1e-9 * self.settings.speed;
+        self.pose_at(self.tenths(f64::from(ix) + share) * 1e8 * 1e-9)
+    }
+
+    /// Pose so many seconds after the first frame, or before it.
+    pub fn pose_at(&self, secs: f64) -> Rigid {
+        let secs = secs * self.settings.speed;
         let hand = noise::hash((self.settings.seed ^ (self.settings.seed >> 32)) as u32);
         trajectory::gt_from_cam(self.settings.scene, secs, (hand, self.settings.shake))
     }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use crate::camera::Intrinsics;
 use crate::depth::DepthMap;
 use crate::image::RgbImage;
+use crate::inertial::ImuSpan;
 use crate::time::{Stamp, Stopwatch};
 use crate::transform::Rigid;
 
@@ -21,6 +22,8 @@ pub struct Frame {
     pub truth: Option<Rigid>,
     /// `odom_from_cam` in metres, where the source has odometry: its steps are right, its places drift.
     pub odometry: Option<Rigid>,
+    /// What an IMU measured since the frame before; of a keyframe, since the keyframe before.
+    pub imu: Option<ImuSpan>,
     /// Depth in metres by something that measures it (exact in synthetic scenes), at image size or smaller.
     pub sensor_depth: Option<Arc<DepthMap>>,
     /// What the second camera of a stereo pair saw at the same time.

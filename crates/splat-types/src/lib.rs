@@ -20,6 +20,8 @@ pub mod pages;
 
 pub mod map_frame;
 
+pub mod inertial;
+
 pub mod frame;
 
 pub mod correction;

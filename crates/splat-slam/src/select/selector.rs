@@ -13,6 +13,7 @@ use crate::select::motion::{
 use crate::select::optical_flow::Pyramid;
 use crate::select::params::SelectParams;
 use splat_types::frame::{Batch, Frame, Keyframe};
+use splat_types::inertial::ImuLog;
 use splat_types::time::Stopwatch;
 
 /// Fewer tracked corners than this say nothing (blank wall, black frame).
@@ -26,6 +27,8 @@ const MAX_RETURN_PX: f32 = 1.5;
 const MAX_FOLLOWED_HZ: f64 = 21.0;
 /// Of the motion that makes a keyframe of a camera's frame: a photo with less is the last one again.
 const REPEATED_SHARE: f64 = 0.125;
+/// Of what an IMU measures between two keyframes, so much is kept.
+const MAX_IMU_SECS: f64 = 60.0;
 /// Frames whose median sharpness is the measure.
 const SHARPNESS_WINDOW: usize = 15;
 
@@ -38,6 +41,8 @@ pub struct Selector {
     takes_photos: bool,
     last: Option<LastKeyframe>,
     sharpness: VecDeque<f32>,
+    /// What an IMU measured since the last keyframe.
+    imu: ImuLog,
 }
 
 struct LastKeyframe {
@@ -80,6 +85,7 @@ impl Selector {
             takes_photos: false,
             last: None,
             sharpness: VecDeque::new(),
+            imu: ImuLog::new(MAX_IMU_SECS),
         }
     }
 
@@ -99,6 +105,9 @@ impl Selector {
 
     /// Returns the frame as a keyframe when the map should keep it.
     pub fn push(&mut self, mut frame: Frame) -> Option<Keyframe> {
+        if let Some(span) = &frame.imu {
+            self.imu.push(span);
+        }
         let every = self.params.holdout_frames;
         frame.is_held_out |= every > 0 && frame.seq % every == every / 2;
         // Held-out frames come besides: those that the map learns from stay nearly the same without them.
@@ -159,7 +168,12 @@ impl Selector {
         true
     }
 
-    fn keep(&mut self, frame: Frame) -> Keyframe {
+    fn keep(&mut self, mut frame: Frame) -> Keyframe {
+        if frame.imu.is_some() {
+            // Samples of the frames between are nobody's otherwise.
+            frame.imu = Some(self.imu.span());
+            self.imu.forget_before(frame.stamp);
+        }
         let id = self.next_id;
         self.next_id += 1;
         Keyframe {

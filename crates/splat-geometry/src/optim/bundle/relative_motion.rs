@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 
 use crate::optim::bundle::problem::{Camera, Flat, RelativeMotion};
 use crate::optim::bundle::reduced::{HELD, Layout, System};
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, skew};
 
 /// Standard deviations at which the loss bends. Observations bend at their `loss_px`, so that one standard deviation of a motion
 /// counts as a third of that in pixels, which is about what a good match is off by.
@@ -65,7 +65,7 @@ impl RelativeMotion {
         };
         let [place, turn] = self.std;
         put(0, [0, 0], DMat3::IDENTITY, place);
-        put(0, [0, 3], cross(-between.translation), place);
+        put(0, [0, 3], skew(-between.translation), place);
         put(0, [3, 3], by_turn, turn);
         put(1, [0, 0], -rotation, place);
         put(1, [3, 3], -log, turn);
@@ -73,19 +73,10 @@ impl RelativeMotion {
     }
 }
 
-/// The matrix that takes the cross product of a vector with what it is applied to.
-fn cross(v: DVec3) -> DMat3 {
-    DMat3::from_cols(
-        DVec3::new(0.0, v.z, -v.y),
-        DVec3::new(-v.z, 0.0, v.x),
-        DVec3::new(v.y, -v.x, 0.0),
-    )
-}
-
 /// Of SO(3) at a rotation vector: by how much its logarithm changes when a small turn comes after it (Forster et al. 2017,
 /// equation 9).
 pub(crate) fn inverse_right_jacobian(v: DVec3) -> DMat3 {
-    let (angle, matrix) = (v.length(), cross(v));
+    let (angle, matrix) = (v.length(), skew(v));
     // The series near zero, where the closed form is 0 / 0.
     let second = if angle < 1e-3 {
         1.0 / 12.0 + angle * angle / 720.0

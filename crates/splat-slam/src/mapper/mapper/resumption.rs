@@ -136,6 +136,7 @@ impl Mapper {
             intrinsics: None,
             truth: None,
             odometry: None,
+            imu: None,
             sensor_depth: None,
             second: None,
             is_held_out,

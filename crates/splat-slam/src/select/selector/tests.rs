@@ -33,6 +33,7 @@ fn frame(seq: u64, shift_px: f64, contrast: f64) -> Frame {
         intrinsics: None,
         truth: None,
         odometry: None,
+        imu: None,
         sensor_depth: None,
         second: None,
         is_held_out: false,
@@ -237,4 +238,36 @@ fn all_of_few_photos_are_keyframes_but_not_the_same_one_again() {
     let of_a_camera = kept_of(None);
     assert!(of_a_camera.len() < 4, "{of_a_camera:?}");
     assert_eq!(kept_of(Some(101)), of_a_camera);
+}
+
+#[test]
+fn a_keyframe_has_what_an_imu_measured_since_the_keyframe_before() {
+    use glam::DVec3;
+    use splat_types::inertial::{ImuSample, ImuSpan};
+    let sample = |millis: i64| ImuSample {
+        stamp: Stamp::from_nanos(millis * 1_000_000),
+        angular_velocity: DVec3::ZERO,
+        acceleration: DVec3::ZERO,
+    };
+    let with_imu = |seq: u64| {
+        let at = seq as i64 * 200;
+        let millis = (at - 205)..=(at + 5);
+        let mut frame = frame(seq, 8.0 * seq as f64, 1.0);
+        frame.imu = Some(ImuSpan {
+            samples: millis.step_by(10).map(sample).collect(),
+            imu_in_cam: DVec3::X,
+        });
+        frame
+    };
+    let mut selector = Selector::new(params());
+    let kept: Vec<Keyframe> = (0..9)
+        .filter_map(|seq| selector.push(with_imu(seq)))
+        .collect();
+    let spans = kept.iter().map(|keyframe| {
+        let samples = &keyframe.frame.imu.as_ref().unwrap().samples;
+        let ends = [samples.first(), samples.last()];
+        ends.map(|s| s.unwrap().stamp.nanos / 1_000_000)
+    });
+    let spans: Vec<[i64; 2]> = spans.collect();
+    assert_eq!(spans, [[-205, 5], [-5, 805], [795, 1605]]);
 }

@@ -1,0 +1,206 @@
+//! Places of a camera and forces -> place and speed at the last frame, gravity, units per metre and the accelerometer's bias.
+//!
+//! With places in units of the poses, everything is linear in the speed, gravity, the units per metre and the bias times those. One
+//! pass of a square-root information filter over all frames is the maximum-likelihood estimate. The length of gravity, which is known,
+//! is a condition on the constants.
+
+use glam::{DMat3, DVec3};
+use nalgebra::{DMatrix, DVector, SMatrix};
+
+use crate::inertial::frames::PosedFrame;
+use crate::inertial::information::Information;
+use crate::inertial::noise::{GRAVITY, ImuNoise};
+use crate::inertial::preintegration::Preintegrated;
+use crate::stats::median;
+
+/// Where the unknowns stand: place of the IMU, its speed, gravity, units per metre, the accelerometer's bias in units.
+pub(crate) const PLACE: usize = 0;
+pub(crate) const SPEED: usize = 3;
+pub(crate) const GRAVITY_AT: usize = 6;
+pub(crate) const UNITS: usize = 9;
+pub(crate) const FORCE_BIAS: usize = 10;
+pub(crate) const N: usize = 13;
+/// Those that move.
+const N_MOVING: usize = 6;
+
+/// Passes, since the noise of the forces in units depends on the unit.
+const MAX_PASSES: usize = 6;
+const SAME_UNIT: f64 = 0.02;
+/// Gravity is known to such a share.
+const GRAVITY_ERROR: f64 = 0.003;
+/// Values of all unknowns at the last frame, in units.
+#[derive(Debug, Clone)]
+pub(crate) struct Solution {
+    pub(crate) values: DVector<f64>,
+    pub(crate) covariance: DMatrix<f64>,
+    /// Standard deviations by which all is off: 1 where the noise is as stated.
+    pub(crate) misfit: f64,
+}
+
+impl Solution {
+    pub(crate) fn vector(&self, at: usize) -> DVec3 {
+        vector(&self.values, at)
+    }
+}
+
+fn vector(values: &DVector<f64>, at: usize) -> DVec3 {
+    DVec3::new(values[at], values[at + 1], values[at + 2])
+}
+
+/// `None` where the way shows no unit: hardly any acceleration. `lever`: where the IMU sits, in the camera's axes.
+pub(crate) fn solve(
+    frames: &[PosedFrame],
+    motions: &[Option<Preintegrated>],
+    lever: DVec3,
+    noise: &ImuNoise,
+) -> Option<Solution> {
+    // Any unit does to begin with: where it is too small, forces only count for less.
+    let mut units = first_units(frames);
+    for _ in 0..MAX_PASSES {
+        let found = pass(frames, motions, (lever, units), noise);
+        let (values, covariance) = with_gravity(&found, units)?;
+        let next = values[UNITS];
+        if next.is_nan() || next <= 0.0 {
+            return None;
+        }
+        let is_same = (next / units).ln().abs() < SAME_UNIT;
+        units = next;
+        if is_same {
+            // Noise that is larger than stated widens everything.
+            let variance = found.variance();
+            return Some(Solution {
+                values,
+                covariance: covariance * variance.max(1.0),
+                misfit: variance.sqrt(),
+            });
+        }
+    }
+    None
+}
+
+/// Units per metre of a hand or a robot that moves by half a metre in a second.
+fn first_units(frames: &[PosedFrame]) -> f64 {
+    let speed = |two: &[PosedFrame]| {
+        let way = two[0].world_from_cam.translation - two[1].world_from_cam.translation;
+        way.length() / two[1].stamp.secs_since(two[0].stamp).max(1e-3)
+    };
+    let mut speeds: Vec<f64> = frames.windows(2).map(speed).collect();
+    2.0 * median(&mut speeds).unwrap_or(1.0).max(1e-9)
+}
+
+/// One pass over all frames.
+fn pass(
+    frames: &[PosedFrame],
+    motions: &[Option<Preintegrated>],
+    (lever, units): (DVec3, f64),
+    noise: &ImuNoise,
+) -> Information {
+    let mut known = Information::nothing(N);
+    let mut bias = DMatrix::zeros(3, N + 1);
+    (0..3).for_each(|i| bias[(i, FORCE_BIAS + i)] = 1.0 / (noise.accelerometer_bias * units));
+    known.add(&bias);
+    known.add(&seen_place(&frames[0], lever));
+    for (two, motion) in frames.windows(2).zip(motions) {
+        match motion {
+            Some(motion) => {
+                let rotation = two[0].world_from_cam.rotation_matrix();
+                known.replace_first(N_MOVING, &moved(motion, &rotation, units, noise));
+            }
+            // What moves is not known any more, the constants are.
+            None => known.replace_first(N_MOVING, &DMatrix::zeros(0, N + N_MOVING + 1)),
+        }
+        known.add(&seen_place(&two[1], lever));
+    }
+    known
+}
+
+/// place - units R lever = the camera's place.
+fn seen_place(frame: &PosedFrame, lever: DVec3) -> DMatrix<f64> {
+    let weight = 1.0 / frame.std[0];
+    let place = frame.world_from_cam.translation;
+    let lever = frame.world_from_cam.rotation * lever;
+    let mut rows = DMatrix::zeros(3, N + 1);
+    for i in 0..3 {
+        rows[(i, PLACE + i)] = weight;
+        rows[(i, UNITS)] = -weight * lever[i];
+        rows[(i, N)] = weight * place[i];
+    }
+    rows
+}
+
+/// How place and speed go on from one frame to the next, in standard deviations.
+fn moved(motion: &Preintegrated, rotation: &DMat3, units: f64, noise: &ImuNoise) -> DMatrix<f64> {
+    let (secs, n) = (motion.secs, N + N_MOVING);
+    // Columns: moving before, moving after, constants, value.
+    let (after, constants) = (N_MOVING, N_MOVING);
+    let mut rows = DMatrix::zeros(6, n + 1);
+    let (place, speed) = (*rotation * motion.place, *rotation * motion.speed);
+    let by_bias = [
+        *rotation * motion.place_by_accelerometer,
+        *rotation * motion.speed_by_accelerometer,
+    ];
+    for i in 0..3 {
+        rows[(i, after + PLACE + i)] = 1.0;
+        rows[(i, PLACE + i)] = -1.0;
+        rows[(i, SPEED + i)] = -secs;
+        rows[(i, constants + GRAVITY_AT + i)] = -0.5 * secs * secs;
+        rows[(i, constants + UNITS)] = -place[i];
+        rows[(3 + i, after + SPEED + i)] = 1.0;
+        rows[(3 + i, SPEED + i)] = -1.0;
+        rows[(3 + i, constants + GRAVITY_AT + i)] = -secs;
+        rows[(3 + i, constants + UNITS)] = -speed[i];
+        for j in 0..3 {
+            rows[(i, constants + FORCE_BIAS + j)] = -by_bias[0].col(j)[i];
+            rows[(3 + i, constants + FORCE_BIAS + j)] = -by_bias[1].col(j)[i];
+        }
+    }
+    let covariance = step_covariance(motion, rotation, noise) * (units * units);
+    match covariance.cholesky() {
+        Some(root) => root.l().solve_lower_triangular(&rows).unwrap_or(rows),
+        None => rows,
+    }
+}
+
+/// Of place and speed after a motion, metres.
+pub(crate) fn step_covariance(
+    motion: &Preintegrated,
+    rotation: &DMat3,
+    noise: &ImuNoise,
+) -> SMatrix<f64, 6, 6> {
+    let mut turned = SMatrix::<f64, 6, 9>::zeros();
+    for row in 0..3 {
+        for column in 0..3 {
+            let at = rotation.col(column)[row];
+            turned[(row, 6 + column)] = at;
+            turned[(3 + row, 3 + column)] = at;
+        }
+    }
+    let mut covariance = turned * motion.covariance() * turned.transpose();
+    // The images' tilt is off anew in every frame, and gravity with it.
+    let tilt = GRAVITY * noise.tilt * motion.secs;
+    let (place, speed) = (0.5 * motion.secs * tilt, tilt);
+    for i in 0..3 {
+        covariance[(i, i)] += place * place;
+        covariance[(3 + i, 3 + i)] += speed * speed;
+        covariance[(i, 3 + i)] += place * speed;
+        covariance[(3 + i, i)] += place * speed;
+    }
+    // Rounding of two samples' worth of noise keeps it positive.
+    covariance + SMatrix::identity() * 1e-16
+}
+
+/// Solves with the length of gravity, which is units per metre times 9.81: a condition that is not linear, so a few times.
+fn with_gravity(found: &Information, units: f64) -> Option<(DVector<f64>, DMatrix<f64>)> {
+    let (mut values, mut covariance) = found.solve()?;
+    for _ in 0..4 {
+        let direction = vector(&values, GRAVITY_AT).try_normalize()?;
+        let weight = 1.0 / (GRAVITY_ERROR * GRAVITY * units);
+        let mut row = DMatrix::zeros(1, N + 1);
+        (0..3).for_each(|i| row[(0, GRAVITY_AT + i)] = weight * direction[i]);
+        row[(0, UNITS)] = -weight * GRAVITY;
+        let mut with = found.clone();
+        with.add(&row);
+        (values, covariance) = with.solve()?;
+    }
+    Some((values, covariance))
+}
