@@ -192,6 +192,8 @@ impl TrackStage {
                 },
                 odom_from_cam: frame.odometry,
                 is_odometry_out: self.tracker.as_ref().is_some_and(Tracker::is_odometry_out),
+                up_in_cam: self.tracker.as_ref().and_then(Tracker::up_in_cam),
+                imu_fault: self.tracker.as_ref().and_then(Tracker::imu_fault),
                 base_from_cam: None,
                 moved,
                 latency_secs: since.secs(),

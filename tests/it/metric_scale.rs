@@ -122,7 +122,7 @@ fn scale_survives_files_and_messages_or_is_refused() {
         assert_eq!(Scale::of_numbers(kept.to_numbers()), Some(kept));
     }
     for bad in [
-        (7, 1.0, 0.0),
+        (8, 1.0, 0.0),
         (2, f64::NAN, 0.0),
         (2, -1.0, 0.0),
         (2, 1.0, f64::INFINITY),

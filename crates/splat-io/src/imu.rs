@@ -7,15 +7,38 @@ use glam::{DQuat, DVec3};
 use crate::params::SourceParams;
 use splat_msgs::ros::imu::Imu;
 use splat_msgs::ros::{self, Vector3};
-use splat_types::inertial::{ImuSample, ImuSpan};
+use splat_types::inertial::{ImuModel, ImuSample, ImuSpan};
 use splat_types::time::Stamp;
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, parse_transform};
 
 /// Samples that wait for a frame: half a minute at 1,000 Hz.
 const MAX_WAITING: usize = 30_000;
+/// An IMU that is further behind the images is silent.
+const WAITED_SECS: f64 = 0.3;
 /// Beyond what MEMS sensors measure, rad/s and m/s^2.
 const MAX_RATE: f64 = 100.0;
 const MAX_ACCELERATION: f64 = 500.0;
+
+/// How an IMU is mounted, and its noise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MountedImu {
+    /// Turns the axes of the IMU into those of the camera.
+    turn: DQuat,
+    model: ImuModel,
+}
+
+impl MountedImu {
+    pub fn new(cam_from_imu: &Rigid, params: &SourceParams) -> Self {
+        Self {
+            turn: cam_from_imu.rotation,
+            model: ImuModel {
+                imu_in_cam: cam_from_imu.translation,
+                gyro_noise: params.imu_gyro_noise,
+                accelerometer_noise: params.imu_accelerometer_noise,
+            },
+        }
+    }
+}
 
 /// Samples that came and belong to no frame yet, in the axes of the IMU.
 #[derive(Debug, Default)]
@@ -49,6 +72,12 @@ impl ImuBuffer {
         self.samples.back().map(|s| s.stamp)
     }
 
+    /// Whether samples up to a frame are still on their way. One that has been silent for a while is not waited for.
+    pub fn is_behind(&self, stamp: Stamp) -> bool {
+        self.newest()
+            .is_some_and(|newest| newest < stamp && stamp.secs_since(newest) < WAITED_SECS)
+    }
+
     /// The frame that the messages name; empty before the first.
     pub fn frame_id(&self) -> &str {
         &self.frame_id
@@ -56,7 +85,7 @@ impl ImuBuffer {
 
     /// What goes with a frame: all since the frame before, and the last before that. `None` where nothing is newer than the frame
     /// before.
-    pub fn take_until(&mut self, stamp: Stamp, cam_from_imu: &Rigid) -> Option<ImuSpan> {
+    pub fn take_until(&mut self, stamp: Stamp, mounted: &MountedImu) -> Option<ImuSpan> {
         // The first one that is not before the frame ends it.
         let before = self.samples.partition_point(|s| s.stamp < stamp);
         let end = (before + 1).min(self.samples.len());
@@ -65,15 +94,15 @@ impl ImuBuffer {
         }
         let in_cam = |s: &ImuSample| ImuSample {
             stamp: s.stamp,
-            angular_velocity: cam_from_imu.rotation * s.angular_velocity,
-            acceleration: cam_from_imu.rotation * s.acceleration,
+            angular_velocity: mounted.turn * s.angular_velocity,
+            acceleration: mounted.turn * s.acceleration,
         };
         let samples = self.samples.range(..end).map(in_cam).collect();
         // The next frame begins with the last sample before this one.
         self.samples.drain(..before.saturating_sub(1).min(end - 1));
         Some(ImuSpan {
             samples,
-            imu_in_cam: cam_from_imu.translation,
+            model: mounted.model,
         })
     }
 
@@ -120,22 +149,12 @@ pub fn extrinsic_of(params: &SourceParams) -> Result<Option<Rigid>, String> {
     if text.is_empty() {
         return Ok(None);
     }
-    let wrong = || {
+    let mounted = parse_transform(text).ok_or_else(|| {
         format!(
-            "source.imu_extrinsic is {text:?}, expected seven numbers \"x y z qx qy qz qw\": metres and a quaternion of length 1"
+            "source.imu_extrinsic is {text:?}, expected seven numbers \"x y z qx qy qz qw\": metres and a quaternion"
         )
-    };
-    let numbers: Option<Vec<f64>> = text.split_whitespace().map(|n| n.parse().ok()).collect();
-    let numbers = numbers.ok_or_else(wrong)?;
-    let &[x, y, z, qx, qy, qz, qw] = numbers.as_slice() else {
-        return Err(wrong());
-    };
-    let rotation = DQuat::from_xyzw(qx, qy, qz, qw);
-    let translation = DVec3::new(x, y, z);
-    let is_one = (rotation.length() - 1.0).abs() < 0.01 && translation.is_finite();
-    is_one
-        .then(|| Some(Rigid::new(rotation.normalize(), translation)))
-        .ok_or_else(wrong)
+    })?;
+    Ok(Some(mounted))
 }
 
 #[cfg(test)]
@@ -162,10 +181,11 @@ mod tests {
         for ms in (0..100).step_by(10) {
             buffer.push(&payload(millis(ms), |_| ())).unwrap();
         }
-        let mounted = Rigid::new(
+        let cam_from_imu = Rigid::new(
             DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2),
             DVec3::X,
         );
+        let mounted = MountedImu::new(&cam_from_imu, &SourceParams::default());
         let mut take = |ms: i64| {
             let span = buffer.take_until(Stamp::from_nanos(millis(ms)), &mounted)?;
             let stamps = span.samples.iter().map(|s| s.stamp.nanos / 1_000_000);
@@ -173,7 +193,7 @@ mod tests {
         };
         let (stamps, span) = take(33).unwrap();
         assert_eq!(stamps, [0, 10, 20, 30, 40]);
-        assert_eq!(span.imu_in_cam, DVec3::X);
+        assert_eq!(span.model.imu_in_cam, DVec3::X);
         let up = span.samples[0].acceleration;
         assert!(up.distance(-9.81 * DVec3::Y) < 1e-12, "{up}");
         assert_eq!(take(66).unwrap().0, [30, 40, 50, 60, 70]);
@@ -210,7 +230,7 @@ mod tests {
         assert_eq!(of(" "), Ok(None));
         let mounted = of("0.1 0 -0.2 0 0 0.7071 0.7071").unwrap().unwrap();
         assert!(mounted.translation.distance(DVec3::new(0.1, 0.0, -0.2)) < 1e-12);
-        for wrong in ["1 2 3", "a 0 0 0 0 0 1", "0 0 0 0 0 0 0", "nan 0 0 0 0 0 1"] {
+        for wrong in ["1 2 3", "a b c d e f g", "0 0 0 0 0 0 0", "nan 0 0 0 0 0 1"] {
             assert!(of(wrong).unwrap_err().contains("seven numbers"), "{wrong}");
         }
     }

@@ -298,7 +298,7 @@ impl McapSource {
         let imu = self.topics.imu.as_ref();
         let imu = imu.and_then(|topic| {
             let waiting = &mut self.queues.imu;
-            waiting.take_until(arrival.stamp, &topic.cam_from_imu)
+            waiting.take_until(arrival.stamp, &topic.mounted)
         });
         self.intake.frame(
             arrival,

@@ -3,6 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use splat_types::inertial::ImuModel;
+
 /// Parameters `source.*`: which frames of which topics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -37,6 +39,12 @@ pub struct SourceParams {
     /// Where the IMU sits where no transform says: "x y z qx qy qz qw" in the camera's axes (x right, y down, z forward),
     /// metres and a quaternion.
     pub imu_extrinsic: String,
+    /// Noise density of the gyroscope, as data sheets have it.
+    #[schemars(range(min = 1e-6, max = 1.0), extend("unit" = "rad/s/√Hz"))]
+    pub imu_gyro_noise: f64,
+    /// Noise density of the accelerometer.
+    #[schemars(range(min = 1e-6, max = 10.0), extend("unit" = "m/s²/√Hz"))]
+    pub imu_accelerometer_noise: f64,
     /// Images of a folder or scene to use: beginnings of their file names, separated by commas; empty = all.
     pub include_prefixes: String,
     /// Of those, the images that are kept out of optimisation to measure quality, besides map.holdout: beginnings
@@ -75,6 +83,8 @@ impl Default for SourceParams {
             odometry_topic: String::new(),
             imu_topic: String::new(),
             imu_extrinsic: String::new(),
+            imu_gyro_noise: ImuModel::default().gyro_noise,
+            imu_accelerometer_noise: ImuModel::default().accelerometer_noise,
             include_prefixes: String::new(),
             holdout_prefixes: String::new(),
             subsample: 0,

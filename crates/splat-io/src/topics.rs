@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::calibration::{is_rectified, lens_of_camera_info};
 use crate::error::SourceError;
 use crate::ground_truth::{GroundTruth, Odometry};
-use crate::imu::extrinsic_of;
+use crate::imu::{MountedImu, extrinsic_of};
 use crate::params::SourceParams;
 use crate::second_camera::{OfPair, mounted, partner_of};
 use crate::survey::{Survey, Topic};
@@ -237,7 +237,7 @@ pub(crate) fn odometry_of(
 #[derive(Debug)]
 pub(crate) struct ImuTopic {
     pub(crate) name: String,
-    pub(crate) cam_from_imu: Rigid,
+    pub(crate) mounted: MountedImu,
 }
 
 /// The IMU that the parameters name, else the first one whose place beside the camera is known; `None`, and a warning, where there
@@ -262,7 +262,7 @@ pub(crate) fn imu_topic_of(
         let cam_from_imu = by_tf.or(by_params)?;
         Some(ImuTopic {
             name: (*name).clone(),
-            cam_from_imu,
+            mounted: MountedImu::new(&cam_from_imu, params),
         })
     });
     if mounted.is_none() {

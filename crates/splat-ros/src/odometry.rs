@@ -19,6 +19,10 @@ pub struct PoseEvent {
     pub odom_from_cam: Option<Rigid>,
     /// They disagree with the camera.
     pub is_odometry_out: bool,
+    /// What is wrong with the IMU.
+    pub imu_fault: Option<&'static str>,
+    /// Up in the axes of the camera, where an IMU shows it.
+    pub up_in_cam: Option<DVec3>,
     pub base_from_cam: Option<Rigid>,
     /// How the map has moved under the camera since the frame before.
     pub moved: Option<Similarity>,
@@ -45,21 +49,6 @@ pub fn saved_map_frame(saved: Option<MapFrame>, poses: &[KeyframePose]) -> MapFr
     let first = poses.iter().min_by_key(|pose| pose.keyframe_id);
     let first = first.map_or(Rigid::IDENTITY, |pose| pose.world_from_cam);
     saved.unwrap_or_else(|| beginning_at(first))
-}
-
-/// Reads `x y z qx qy qz qw`.
-pub fn parse_transform(text: &str) -> Option<Rigid> {
-    let numbers: Vec<f64> = text
-        .split_whitespace()
-        .map(str::parse)
-        .collect::<Result<_, _>>()
-        .ok()?;
-    let [x, y, z, qx, qy, qz, qw] = numbers.try_into().ok()?;
-    let rotation = DQuat::from_xyzw(qx, qy, qz, qw);
-    let length = rotation.length();
-    let translation = DVec3::new(x, y, z);
-    let is_sound = translation.is_finite() && length.is_finite() && length > 1e-6;
-    is_sound.then(|| Rigid::new(rotation / length, translation))
 }
 
 /// Where the splats' frame lies in the map frame: fixed by the first frame that was seen in both, or by the map that a run goes on from.
@@ -190,7 +179,10 @@ impl Odometer {
             .unwrap_or_else(forward_camera);
         let world_from_cam = pose.world_from_cam;
         if !world.is_anchored() {
-            world.anchor(world_from_cam, live.odom_from_cam.unwrap_or(base_from_cam));
+            // The frame of odometry has an up of its own.
+            let by_mount = || level(base_from_cam, live.up_in_cam);
+            let map_from_cam = live.odom_from_cam.unwrap_or_else(by_mount);
+            world.anchor(world_from_cam, map_from_cam);
         }
         let map_from_world = world.map_from_world();
         let map_from_cam = map_from_world.transform_pose(&world_from_cam);
@@ -239,6 +231,15 @@ impl Odometer {
         step.translation *= metres;
         Some((step, secs))
     }
+}
+
+/// Turns a frame about its origin so that what the camera sees as up is its z axis.
+fn level(frame_from_cam: Rigid, up_in_cam: Option<DVec3>) -> Rigid {
+    let Some(up) = up_in_cam else {
+        return frame_from_cam;
+    };
+    let up = (frame_from_cam.rotation * up).normalize();
+    Rigid::new(DQuat::from_rotation_arc(up, DVec3::Z), DVec3::ZERO) * frame_from_cam
 }
 
 /// Covariance of a camera in its own axes and the splats' unit -> of the base in the axes of the map frame.
@@ -290,6 +291,8 @@ mod tests {
             },
             odom_from_cam: None,
             is_odometry_out: false,
+            imu_fault: None,
+            up_in_cam: None,
             base_from_cam: None,
             moved: None,
             latency_secs: 0.0,
@@ -298,6 +301,21 @@ mod tests {
 
     fn close(a: &Rigid, b: &Rigid) -> bool {
         (a.translation - b.translation).length() < 1e-9 && a.angle_to(b) < 1e-9
+    }
+
+    #[test]
+    fn an_imu_levels_the_map_of_a_camera_that_is_tilted() {
+        let (mut world, mut odometer) = (FrameTree::default(), Odometer::new(None));
+        let tilted = forward_camera() * Rigid::exp(DVec3::ZERO, DVec3::new(-0.4, 0.0, 0.1));
+        let mut first = frame(0.0, Rigid::IDENTITY);
+        first.up_in_cam = Some(tilted.rotation.inverse() * DVec3::Z);
+        let at = odometer.advance(&first, &mut world).unwrap();
+        let map_from_cam = at.map_from_base * forward_camera();
+        let up = map_from_cam.rotation * first.up_in_cam.unwrap();
+        assert!(up.distance(DVec3::Z) < 1e-9, "{up}");
+        // It still looks along x, but for what it was tilted by.
+        let ahead = map_from_cam.rotation * DVec3::Z;
+        assert!(ahead.y.abs() < 0.05 && ahead.x > 0.9, "{ahead}");
     }
 
     #[test]
@@ -377,22 +395,6 @@ mod tests {
             for j in 0..6 {
                 assert!((found[i][j] - wanted[(i, j)]).abs() < 1e-9, "{i} {j}");
             }
-        }
-    }
-
-    #[test]
-    fn a_mount_is_seven_numbers() {
-        assert!(
-            parse_transform("0.1 0 0.3 0 0 0 2").is_some_and(|m| m.rotation == DQuat::IDENTITY)
-        );
-        for bad in [
-            "",
-            "1 2 3",
-            "0 0 0 0 0 0 0",
-            "a b c d e f g",
-            "nan 0 0 0 0 0 1",
-        ] {
-            assert!(parse_transform(bad).is_none(), "{bad}");
         }
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::error::PublishError;
 use crate::navigation::{self, KEYFRAME_CLOUD, KeyframeDepth};
-use crate::odometry::{FrameCells, Odometer, PoseEvent, RobotPose, parse_transform};
+use crate::odometry::{FrameCells, Odometer, PoseEvent, RobotPose};
 use crate::params::PublishParams;
 use crate::pose_messages::LiveMessages;
 use crate::publisher::Publisher;
@@ -12,7 +12,7 @@ use crate::reports::Reports;
 use crate::slew::CorrectionLimiter;
 use crate::transport::{Event, Sample};
 use splat_types::time::{Stamp, Stopwatch};
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, parse_transform};
 
 /// Seconds that transforms go on after the last frame.
 const MAX_REPEAT_SECS: f64 = 1.0;

@@ -96,6 +96,8 @@ pub struct TrackStatus {
     pub n_missed: u64,
     /// Odometry disagrees with the camera.
     pub is_odometry_out: bool,
+    /// What is wrong with the IMU.
+    pub imu_fault: Option<&'static str>,
     pub frame_to_pose: Times,
 }
 
@@ -190,6 +192,11 @@ impl Status<'_> {
                 "odometry disagrees with the camera and is left out: wheels slip, or its stamps or its mounting are wrong"
                     .to_owned(),
             );
+        }
+        if let Some(fault) = self.track.imu_fault {
+            warnings.push(format!(
+                "the IMU {fault} and is left out: look at its topic, its stamps and how it is mounted"
+            ));
         }
         if !self.grid.refused.is_empty() {
             warnings.push(format!("no grid: {}", self.grid.refused));

@@ -38,6 +38,7 @@ impl StatusStream {
         status.state = Some(tracked.state);
         status.reason = tracked.reason.map(|r| r.to_string()).unwrap_or_default();
         status.is_odometry_out = frame.is_odometry_out;
+        status.imu_fault = frame.imu_fault;
         status.n_tracked += u64::from(tracked.is_measured());
         status.n_missed += u64::from(!tracked.is_measured());
         status.frame_to_pose.note(frame.latency_secs);

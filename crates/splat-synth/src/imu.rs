@@ -5,7 +5,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg32;
 
 use crate::take::{Take, gaussian};
-use splat_types::inertial::{ImuSample, ImuSpan};
+use splat_types::inertial::{ImuModel, ImuSample, ImuSpan};
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
@@ -118,7 +118,7 @@ fn exact(take: &Take, secs: f64) -> ImuSample {
 }
 
 /// What goes with each frame of a take, in the camera's axes, as a source of frames has it.
-pub(crate) fn spans(take: &Take) -> Vec<ImuSpan> {
+pub fn spans(take: &Take) -> Vec<ImuSpan> {
     let Some(mut imu) = ImuTake::new(take) else {
         return Vec::new();
     };
@@ -136,7 +136,10 @@ pub(crate) fn spans(take: &Take) -> Vec<ImuSpan> {
         waiting.drain(..n_before.saturating_sub(1));
         ImuSpan {
             samples,
-            imu_in_cam: mounted.translation,
+            model: ImuModel {
+                imu_in_cam: mounted.translation,
+                ..ImuModel::default()
+            },
         }
     };
     frames.map(span).collect()

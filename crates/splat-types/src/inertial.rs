@@ -20,14 +20,35 @@ pub struct ImuSample {
     pub acceleration: DVec3,
 }
 
+/// Where an IMU sits and what its noise is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImuModel {
+    /// In the camera's axes, metres.
+    pub imu_in_cam: DVec3,
+    /// rad/s per root of a hertz.
+    pub gyro_noise: f64,
+    /// m/s^2 per root of a hertz.
+    pub accelerometer_noise: f64,
+}
+
+/// At the camera, with the noise of MEMS sensors on robots and telephones.
+impl Default for ImuModel {
+    fn default() -> Self {
+        Self {
+            imu_in_cam: DVec3::ZERO,
+            gyro_noise: 1e-3,
+            accelerometer_noise: 1e-2,
+        }
+    }
+}
+
 /// What came between the frame before and this one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImuSpan {
     /// Oldest first, each stamp once. The first is the last one before the frame before, and the last one the first that is not
     /// before this frame, where there are such.
     pub samples: Arc<[ImuSample]>,
-    /// Where the IMU sits, in the camera's axes, metres.
-    pub imu_in_cam: DVec3,
+    pub model: ImuModel,
 }
 
 impl ImuSample {
@@ -47,7 +68,7 @@ impl ImuSample {
 #[derive(Debug, Clone)]
 pub struct ImuLog {
     samples: VecDeque<ImuSample>,
-    imu_in_cam: DVec3,
+    model: ImuModel,
     kept_nanos: i64,
 }
 
@@ -56,7 +77,7 @@ impl ImuLog {
     pub fn new(kept_secs: f64) -> Self {
         Self {
             samples: VecDeque::new(),
-            imu_in_cam: DVec3::ZERO,
+            model: ImuModel::default(),
             kept_nanos: (1e9 * kept_secs) as i64,
         }
     }
@@ -64,7 +85,7 @@ impl ImuLog {
     /// Spans come in order of time. One that begins before the last has ended adds what is newer; where time has begun anew,
     /// everything before is forgotten.
     pub fn push(&mut self, span: &ImuSpan) {
-        self.imu_in_cam = span.imu_in_cam;
+        self.model = span.model;
         let first = span.samples.first().map(|s| s.stamp);
         let is_before = |first: Stamp| {
             self.samples
@@ -96,9 +117,8 @@ impl ImuLog {
         self.samples.is_empty()
     }
 
-    /// Where the IMU sits, in the camera's axes, metres.
-    pub fn imu_in_cam(&self) -> DVec3 {
-        self.imu_in_cam
+    pub fn model(&self) -> &ImuModel {
+        &self.model
     }
 
     /// The samples from one time to another, with interpolated ones at both ends. `None` where they don't reach, or leave a gap.
@@ -147,7 +167,7 @@ impl ImuLog {
     pub fn span(&self) -> ImuSpan {
         ImuSpan {
             samples: self.samples.iter().copied().collect(),
-            imu_in_cam: self.imu_in_cam,
+            model: self.model,
         }
     }
 
@@ -174,7 +194,7 @@ mod tests {
         let mut log = ImuLog::new(10.0);
         log.push(&ImuSpan {
             samples: millis.iter().map(|m| sample(*m)).collect(),
-            imu_in_cam: DVec3::ZERO,
+            model: ImuModel::default(),
         });
         log
     }
@@ -214,14 +234,14 @@ mod tests {
         let mut log = log(&[0, 10, 20]);
         log.push(&ImuSpan {
             samples: [10, 20, 30].map(sample).to_vec().into(),
-            imu_in_cam: DVec3::X,
+            model: ImuModel::default(),
         });
         assert_eq!(log.span().samples.len(), 4);
         log.forget_before(at(25));
         assert_eq!(log.span().samples.to_vec(), [20, 30].map(sample).to_vec());
         log.push(&ImuSpan {
             samples: [5, 10].map(sample).to_vec().into(),
-            imu_in_cam: DVec3::X,
+            model: ImuModel::default(),
         });
         assert_eq!(log.newest(), Some(at(10)));
     }

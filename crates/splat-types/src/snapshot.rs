@@ -25,10 +25,12 @@ pub enum ScaleSource {
     Baseline,
     /// How far the cameras of a stereo pair are apart.
     Stereo,
+    /// What an IMU measured of the camera's way.
+    Imu,
 }
 
 impl ScaleSource {
-    const ALL: [Self; 7] = [
+    const ALL: [Self; 8] = [
         Self::UpToScale,
         Self::Given,
         Self::Odometry,
@@ -36,6 +38,7 @@ impl ScaleSource {
         Self::Height,
         Self::Baseline,
         Self::Stereo,
+        Self::Imu,
     ];
 
     /// As reports have it.
@@ -48,6 +51,7 @@ impl ScaleSource {
             Self::Height => "camera_height",
             Self::Baseline => "baseline",
             Self::Stereo => "stereo",
+            Self::Imu => "imu",
         }
     }
 
@@ -61,6 +65,7 @@ impl ScaleSource {
             Self::Height => 4,
             Self::Baseline => 5,
             Self::Stereo => 6,
+            Self::Imu => 7,
         }
     }
 

@@ -229,6 +229,21 @@ pub fn extent(points: &[DVec3]) -> f64 {
     longest(&outermost)
 }
 
+/// Reads `x y z qx qy qz qw`.
+pub fn parse_transform(text: &str) -> Option<Rigid> {
+    let numbers: Vec<f64> = text
+        .split_whitespace()
+        .map(str::parse)
+        .collect::<Result<_, _>>()
+        .ok()?;
+    let [x, y, z, qx, qy, qz, qw] = numbers.try_into().ok()?;
+    let rotation = DQuat::from_xyzw(qx, qy, qz, qw);
+    let length = rotation.length();
+    let translation = DVec3::new(x, y, z);
+    let is_sound = translation.is_finite() && length.is_finite() && length > 1e-6;
+    is_sound.then(|| Rigid::new(rotation / length, translation))
+}
+
 /// `skew(a) * b == a.cross(b)`.
 #[inline]
 pub fn skew(a: DVec3) -> DMat3 {

@@ -136,7 +136,7 @@ pub fn align(
         gyro_bias: calibration.bias.gyro,
         ..turns
     };
-    let lever = DQuat::from_scaled_axis(calibration.mount) * log.imu_in_cam();
+    let lever = DQuat::from_scaled_axis(calibration.mount) * log.model().imu_in_cam;
     let metric = solve(frames, &motions, lever, noise).map(MetricAlignment::of);
     if let Some(metric) = &metric {
         let bias = metric.solution.vector(FORCE_BIAS);
@@ -335,7 +335,7 @@ impl InertialAlignment {
         let rotation = DMat3::from_quat(self.turn);
         let (secs, units) = (motion.secs, solution.values[UNITS]);
         let turn = (self.turn * motion.turn).normalize();
-        let lever = DQuat::from_scaled_axis(self.calibration.mount) * log.imu_in_cam();
+        let lever = DQuat::from_scaled_axis(self.calibration.mount) * log.model().imu_in_cam;
         let by_units = rotation * motion.place - turn * lever;
         let by_bias = rotation * motion.place_by_accelerometer;
         let mut slope = SMatrix::<f64, 3, N>::zeros();

@@ -1,5 +1,7 @@
 //! What inertial sensors are off by.
 
+use splat_types::inertial::ImuModel;
+
 /// m/s^2, near enough anywhere on Earth (within 0.3 %).
 pub const GRAVITY: f64 = 9.81;
 
@@ -17,15 +19,22 @@ pub struct ImuNoise {
     pub tilt: f64,
 }
 
+impl ImuNoise {
+    /// Of an IMU whose densities are known.
+    pub fn of(model: &ImuModel) -> Self {
+        Self {
+            gyro: model.gyro_noise,
+            accelerometer: model.accelerometer_noise,
+            gyro_bias: 0.05,
+            accelerometer_bias: 0.15,
+            tilt: 0.001,
+        }
+    }
+}
+
 /// Of MEMS sensors on robots and telephones.
 impl Default for ImuNoise {
     fn default() -> Self {
-        Self {
-            gyro: 1e-3,
-            accelerometer: 1e-2,
-            gyro_bias: 0.05,
-            accelerometer_bias: 0.15,
-            tilt: 0.002,
-        }
+        Self::of(&ImuModel::default())
     }
 }

@@ -11,7 +11,7 @@ use crate::inertial::noise::ImuNoise;
 use crate::stats::median;
 
 /// Standard deviations of what is believed before: turn of the mount in radians, delay in seconds.
-const MOUNT_STD: f64 = 0.03;
+const MOUNT_STD: f64 = 0.01;
 const DELAY_STD: f64 = 0.01;
 /// Residuals beyond so many standard deviations count for less (Cauchy's loss).
 const LOSS_STD: f64 = 3.0;

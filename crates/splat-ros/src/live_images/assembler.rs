@@ -129,6 +129,9 @@ impl Assembler {
                 self.camera_frame
             ));
         }
+        if self.intake.is_some() {
+            warnings.extend(self.beside.imu_fault(&self.camera_frame));
+        }
         warnings
     }
 
@@ -246,9 +249,11 @@ impl Assembler {
         }
         match image_of(&image.payload, is_compressed) {
             Ok(pixels) => {
+                let imu = self.beside.take_imu(&self.camera_frame, stamp);
                 let extras = Extras {
                     truth: companions.truth,
                     odometry: companions.odometry,
+                    imu,
                     sensor_depth,
                     second,
                     ..Extras::default()

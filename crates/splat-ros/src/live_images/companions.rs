@@ -1,4 +1,4 @@
-//! What comes beside live images: calibration, transforms, odometry, true poses, depth, a second camera. Newest wins, old is forgotten.
+//! What comes beside live images: calibration, transforms, odometry, an IMU, true poses, depth, a second camera. Newest wins, old is forgotten.
 //!
 //! Filled on the threads of ROS 2 or zenoh, read on the source's.
 
@@ -8,13 +8,16 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use splat_io::calibration::{is_rectified, lens_of_camera_info};
 use splat_io::depth_registration::{Calibrated, Registration, registration};
 use splat_io::ground_truth::{Track, Transforms};
+use splat_io::imu::{ImuBuffer, MountedImu, extrinsic_of};
 use splat_io::params::SourceParams;
 use splat_io::second_camera::{OfPair, mounted};
 use splat_io::survey::header_stamp;
 use splat_io::topics::{info_beside, info_topic_of};
+use splat_msgs::ros::imu::Imu;
 use splat_msgs::ros::odometry::Odometry;
 use splat_msgs::ros::{self, CameraInfo, CompressedImage, Image, Message, PoseStamped, TfMessage};
 use splat_types::camera::CameraModel;
+use splat_types::inertial::ImuSpan;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
 
@@ -40,6 +43,7 @@ pub(crate) struct CompanionState {
     seconds: VecDeque<(Stamp, Vec<u8>)>,
     second_info: Option<CameraInfo>,
     depth_info: Option<CameraInfo>,
+    imu: ImuBuffer,
     n_messages: u32,
     has_moving_transforms: bool,
 }
@@ -49,14 +53,10 @@ pub(crate) struct CompanionState {
 pub(crate) struct Beside {
     received: Arc<Mutex<CompanionState>>,
     pub(crate) info_topic: String,
-    odometry_topic: String,
-    pose_topic: String,
-    depth_topic: String,
+    params: SourceParams,
     odom_frame: String,
     pub(crate) has_odometry_topic: bool,
-    has_truth_topic: bool,
     pub(crate) has_depth_topic: bool,
-    depth_within_nanos: u64,
     pub(crate) is_depth_compressed: bool,
     pub(crate) second: Option<SecondTopics>,
 }
@@ -88,6 +88,7 @@ pub(crate) enum Kind {
     StaticTransforms,
     Transforms,
     Odometry,
+    Imu,
     TruePose,
     Depth,
     SecondImage,
@@ -107,14 +108,10 @@ impl Beside {
         Self {
             received: Arc::default(),
             info_topic: info_topic.to_owned(),
-            odometry_topic: params.odometry_topic.clone(),
-            pose_topic: params.pose_topic.clone(),
-            depth_topic: params.depth_topic.clone(),
+            params: params.clone(),
             odom_frame: odom_frame.to_owned(),
             has_odometry_topic: !params.odometry_topic.is_empty(),
-            has_truth_topic: !params.pose_topic.is_empty(),
             has_depth_topic: !params.depth_topic.is_empty(),
-            depth_within_nanos: (1e9 * params.depth_tolerance) as u64,
             is_depth_compressed: is_compressed(&params.depth_topic),
             second: SecondTopics::of(params),
         }
@@ -129,6 +126,7 @@ impl Beside {
                 Image::TYPE_NAME
             }
         };
+        let params = &self.params;
         let mut topics = Vec::new();
         let mut add = |name: &str, type_name, kind| {
             if !name.is_empty() {
@@ -142,12 +140,13 @@ impl Beside {
         add(&self.info_topic, CameraInfo::TYPE_NAME, Kind::CameraInfo);
         add("/tf_static", TfMessage::TYPE_NAME, Kind::StaticTransforms);
         add("/tf", TfMessage::TYPE_NAME, Kind::Transforms);
-        add(&self.odometry_topic, Odometry::TYPE_NAME, Kind::Odometry);
-        add(&self.pose_topic, PoseStamped::TYPE_NAME, Kind::TruePose);
+        add(&params.odometry_topic, Odometry::TYPE_NAME, Kind::Odometry);
+        add(&params.imu_topic, Imu::TYPE_NAME, Kind::Imu);
+        add(&params.pose_topic, PoseStamped::TYPE_NAME, Kind::TruePose);
         let depth_type = image(self.is_depth_compressed);
-        add(&self.depth_topic, depth_type, Kind::Depth);
+        add(&params.depth_topic, depth_type, Kind::Depth);
         if self.has_depth_topic {
-            let info_topic = info_beside(&self.depth_topic);
+            let info_topic = info_beside(&params.depth_topic);
             add(&info_topic, CameraInfo::TYPE_NAME, Kind::DepthCameraInfo);
         }
         if let Some(second) = &self.second {
@@ -261,13 +260,15 @@ impl Beside {
             None
         };
         let truth = received.poses.nearest(stamp, TRUTH_WITHIN_NANOS);
-        let depth = nearest(&received.depths, stamp, self.depth_within_nanos);
+        let depth_within = (1e9 * self.params.depth_tolerance) as u64;
+        let depth = nearest(&received.depths, stamp, depth_within);
         let second = self.second.as_ref();
         let second = second.and_then(|s| nearest(&received.seconds, stamp, s.within_nanos));
         let is_whole = (odometry.is_some() || !(self.has_odometry_topic || uses_transforms))
-            && (truth.is_some() || !self.has_truth_topic)
+            && (truth.is_some() || self.params.pose_topic.is_empty())
             && (depth.is_some() || !self.has_depth_topic)
-            && (second.is_some() || self.second.is_none());
+            && (second.is_some() || self.second.is_none())
+            && !received.imu.is_behind(stamp);
         let companions = Companions {
             odometry,
             truth,
@@ -275,6 +276,41 @@ impl Beside {
             second,
         };
         (companions, is_whole)
+    }
+
+    /// How the IMU is mounted, `cam_from_imu`, by tf or by its parameter; `None` while neither says, or no sample has come.
+    fn imu_mount(&self, received: &CompanionState, camera_frame: &str) -> Option<Rigid> {
+        let imu_frame = received.imu.frame_id();
+        let is_named = !imu_frame.is_empty() && !camera_frame.is_empty();
+        let by_tf = received.transforms.between(camera_frame, imu_frame);
+        let by_params = || extrinsic_of(&self.params).ok().flatten();
+        by_tf.filter(|_| is_named).or_else(by_params)
+    }
+
+    /// What the IMU measured up to an image; what is before it is asked for once.
+    pub(crate) fn take_imu(&self, camera_frame: &str, stamp: Stamp) -> Option<ImuSpan> {
+        let mut received = lock(&self.received);
+        let cam_from_imu = self.imu_mount(&received, camera_frame)?;
+        let mounted = MountedImu::new(&cam_from_imu, &self.params);
+        received.imu.take_until(stamp, &mounted)
+    }
+
+    /// Why an IMU is not used whose samples come, or why none come; `None` where nothing is wrong.
+    pub(crate) fn imu_fault(&self, camera_frame: &str) -> Option<String> {
+        let topic = &self.params.imu_topic;
+        let received = lock(&self.received);
+        if topic.is_empty() {
+            None
+        } else if received.imu.newest().is_none() {
+            Some(format!("no samples on {topic:?} (source.imu_topic)"))
+        } else if self.imu_mount(&received, camera_frame).is_none() {
+            Some(format!(
+                "tf does not lead from the camera {camera_frame:?} to the IMU {:?}: publish it on /tf_static, or set source.imu_extrinsic",
+                received.imu.frame_id()
+            ))
+        } else {
+            None
+        }
     }
 
     /// Time begins anew: what moved before is of no use, how things are mounted is.
@@ -288,6 +324,7 @@ impl Beside {
         received.poses = Track::default();
         received.depths.clear();
         received.seconds.clear();
+        received.imu.clear();
     }
 }
 
@@ -317,6 +354,7 @@ impl CompanionState {
                 }
                 self.tidy(Some(stamp));
             }
+            Kind::Imu => self.imu.push(&payload)?,
             Kind::TruePose => {
                 let message: PoseStamped = decoded(&payload)?;
                 let stamp = message.header.stamp.into();

@@ -16,6 +16,7 @@ use crate::ros2::params::OnTimeJump;
 use crate::ros2::topic_watch::{Watch, why_silent};
 use splat_io::error::SourceError;
 use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
+use splat_io::imu::extrinsic_of;
 use splat_io::params::SourceParams;
 use splat_io::queue::Received;
 use splat_io::topics::info_topic_of;
@@ -58,6 +59,7 @@ impl Ros2Source {
         let link = Link::current().ok_or_else(|| {
             fail("the node is not up; ros2.enabled=off leaves no way to receive ROS 2".to_owned())
         })?;
+        extrinsic_of(params).map_err(fail)?;
         let info_topic = info_topic_of(&params.camera_info_topic, topic);
         let beside = Beside::new(params, &info_topic, &link.setup.odom_frame);
         subscribe(&beside, &link).map_err(|e| fail(e.to_string()))?;
@@ -178,6 +180,8 @@ fn subscribe(beside: &Beside, link: &Link) -> Result<(), LinkError> {
             Kind::Transforms | Kind::Odometry | Kind::TruePose => {
                 QosProfile::default().keep_last(100).best_effort()
             }
+            // A second of a fast one, should this process be held up.
+            Kind::Imu => QosProfile::default().keep_last(1000).best_effort(),
             _ => QosProfile::sensor_data(),
         };
         let sink = beside.sink(topic.kind);

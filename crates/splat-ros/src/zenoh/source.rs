@@ -16,6 +16,7 @@ use crate::zenoh::names::Names;
 use crate::zenoh::session::open_session;
 use splat_io::error::SourceError;
 use splat_io::frame_source::{MetricInput, Polled, Source, SourceCounts, next_polled};
+use splat_io::imu::extrinsic_of;
 use splat_io::params::SourceParams;
 use splat_io::queue::{Received, Receiver, Sender, WhenFull, queue};
 use splat_io::topics::info_topic_of;
@@ -77,6 +78,7 @@ impl ZenohSource {
             let reason = "a topic is wanted, such as zenoh:/camera/image_raw";
             return Err(fail(reason.to_owned()));
         }
+        extrinsic_of(params).map_err(fail)?;
         let info_topic = info_topic_of(&params.camera_info_topic, topic);
         // The publisher has a session of its own, which listens.
         let publish = PublishParams {

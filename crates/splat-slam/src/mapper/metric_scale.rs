@@ -3,6 +3,7 @@
 //! A camera alone shows no lengths. Wheels, a depth camera, the height at which the camera is mounted or one measured
 //! distance do; each gives many ratios, of which some are wrong.
 
+use crate::mapper::inertial_scale;
 use crate::mapper::keyframes::metric_ratios;
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
 use crate::mapper::keyframes::store::KeyframeStore;
@@ -199,6 +200,10 @@ fn estimates<'a>(
             .collect();
         let estimate = of_odometry(&track, params.odometry_error);
         found.push((ScaleSource::Odometry, estimate));
+    }
+    if may(MetricSource::Imu) {
+        let estimate = inertial_scale::metres_per_unit(registered.iter().copied(), poses);
+        found.push((ScaleSource::Imu, estimate));
     }
     if may(MetricSource::Depth) {
         found.push((ScaleSource::Depth, robust(all(0), DEPTH_ERROR)));

@@ -13,6 +13,8 @@ pub enum MetricSource {
     Off,
     /// Wheel odometry.
     Odometry,
+    /// An IMU.
+    Imu,
     /// Depth images.
     Depth,
     /// Height of the camera above the floor.
@@ -25,7 +27,7 @@ pub enum MetricSource {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ScaleParams {
-    /// What gives the map its scale in metres where geometry has none: wheel odometry, depth images, the height
+    /// What gives the map its scale in metres where geometry has none: wheel odometry, an IMU, depth images, the height
     /// of the camera above the floor, a measured distance; auto takes the most certain one available.
     pub source: MetricSource,
     /// Expected relative error of the scale of odometry: worn wheels, a wrong radius.

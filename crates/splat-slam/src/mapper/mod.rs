@@ -12,6 +12,8 @@ pub(crate) mod cameras;
 
 pub mod keyframes;
 
+mod inertial_scale;
+
 mod metric_scale;
 
 mod depth_scale;

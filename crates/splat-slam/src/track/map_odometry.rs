@@ -2,6 +2,7 @@
 
 use crate::track::align::AlignmentFrame;
 use crate::track::anchor::Anchor;
+use crate::track::inertial_odometry::InertialOdometry;
 use crate::track::landmarks::KeyframeView;
 use crate::track::odometry_link::{LinkedKeyframe, LinkedMotion, LinkedPose, OdometryLink};
 use crate::track::wheel_odometry::{MeasuredFrame, WheelOdometry};
@@ -45,6 +46,7 @@ pub(crate) struct MapOdometry {
     link: OdometryLink,
     /// Odometry that the source has, such as that of wheels.
     wheels: WheelOdometry,
+    pub(crate) inertial: InertialOdometry,
     camera: Option<FrameCamera>,
     before_map: BeforeMap,
 }
@@ -55,6 +57,7 @@ impl MapOdometry {
             odometry: is_on.then(VisualOdometry::default),
             link: OdometryLink::default(),
             wheels: WheelOdometry::default(),
+            inertial: InertialOdometry::default(),
             camera: None,
             before_map: BeforeMap::Waiting,
         }
@@ -76,14 +79,15 @@ impl MapOdometry {
         Some(AlignmentFrame { pyramid, camera })
     }
 
-    /// What the source's odometry says of one more frame, whatever its image shows.
-    pub(crate) fn follow_wheels(&mut self, frame: &Frame) {
+    /// What the source's odometry and its IMU say of one more frame, whatever its image shows.
+    pub(crate) fn follow_sensors(&mut self, frame: &Frame) {
         self.wheels.push(frame);
+        self.inertial.push(frame);
     }
 
     /// Odometry of one more frame.
     pub(crate) fn follow(&mut self, frame: &Frame) -> Option<OdometryPose> {
-        self.follow_wheels(frame);
+        self.follow_sensors(frame);
         let odometry = self.odometry.as_mut()?;
         let size = (frame.image.width_px, frame.image.height_px);
         let is_same = |known: &FrameCamera| {
@@ -93,7 +97,10 @@ impl MapOdometry {
         let known = self.camera.filter(is_same).map(|known| known.refined);
         let stated = frame.intrinsics.as_ref();
         let camera = known.or_else(|| WorkingCamera::of(stated?, None, size));
-        let found = odometry.push(frame, camera.as_ref());
+        let inertial = &self.inertial;
+        let found = odometry.push_turned(frame, camera.as_ref(), |from| {
+            inertial.turn(from, frame.stamp)
+        });
         self.link.push(frame.seq, found.pose);
         found.pose
     }
@@ -128,9 +135,9 @@ impl MapOdometry {
         (!self.wheels.is_out()).then_some(&self.wheels)
     }
 
-    /// Whether the source has odometry.
+    /// Whether the source has odometry or an IMU.
     pub(crate) fn has_source(&self) -> bool {
-        self.wheels.has_come()
+        self.wheels.has_come() || self.inertial.has_come()
     }
 
     /// Whether odometry of the source disagrees with the camera and is left out.
@@ -138,14 +145,19 @@ impl MapOdometry {
         self.wheels.is_out()
     }
 
-    /// One more frame whose place was measured in the map, as `WheelOdometry::compare` takes it.
-    pub(crate) fn compare(
+    /// One more frame whose place was measured in the map; `pose_of` gives those of frames before by the map of this moment.
+    pub(crate) fn measured(
         &mut self,
         frame: MeasuredFrame,
         scene_depth: f64,
         pose_of: impl Fn(&Anchor) -> Option<Rigid>,
     ) {
-        self.wheels.compare(frame, scene_depth, pose_of);
+        if self.wheels.has_come() {
+            self.wheels.compare(frame, scene_depth, &pose_of);
+        }
+        if self.inertial.has_come() {
+            self.inertial.measured(frame, scene_depth, &pose_of);
+        }
     }
 
     /// Whether a pose is to be reported in odometry's frame, as there is no map: the first segment's.

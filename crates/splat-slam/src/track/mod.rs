@@ -26,7 +26,11 @@ mod landmark_file;
 
 mod odometry_link;
 
+mod sensor_check;
+
 mod wheel_odometry;
+
+mod inertial_odometry;
 
 mod map_odometry;
 

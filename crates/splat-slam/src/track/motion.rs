@@ -1,6 +1,6 @@
 //! The last poses -> where the camera is next, if it goes on as it went, and how far off that may be.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use nalgebra::Matrix6;
 
 use splat_types::time::Stamp;
@@ -55,6 +55,17 @@ impl Motion {
         let turn = turn_of(step) * share;
         let next = Rigid::exp(DVec3::ZERO, turn) * self.cam_from_world;
         Rigid::new(next.rotation, next.translation + step.translation * share).renormalized()
+    }
+
+    /// The same where something has measured the turn since, `earlier_from_later`.
+    pub(crate) fn ahead_turned(&self, stamp: Stamp, turn: Option<DQuat>) -> Rigid {
+        let ahead = self.ahead(stamp);
+        let Some(turn) = turn else {
+            return ahead;
+        };
+        let place = ahead.inverse().translation;
+        let rotation = (turn.inverse() * self.cam_from_world.rotation).normalize();
+        Rigid::new(rotation, -(rotation * place))
     }
 
     /// How far off `ahead` may be: the last pose's own covariance, and a motion that is as unknown as it is large.

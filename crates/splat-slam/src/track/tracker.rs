@@ -5,6 +5,7 @@
 
 mod finding;
 mod reported;
+mod sensors;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -16,12 +17,12 @@ use crate::track::history::{FrameTrack, History, Tracks};
 use crate::track::keyframe_poses::KeyframePoses;
 use crate::track::landmark_file::{landmark_bytes, parse_landmarks};
 use crate::track::landmarks::{KeyframeView, Landmarks};
-use crate::track::localize::{Localized, Localizer, transported};
+use crate::track::localize::{Localized, Localizer};
 use crate::track::map_odometry::MapOdometry;
 use crate::track::map_points::MapPoints;
 use crate::track::motion::Motion;
 use crate::track::observation::Observation;
-use crate::track::odometry_link::{LinkedMotion, LinkedPose};
+use crate::track::odometry_link::LinkedPose;
 use crate::track::params::TrackParams;
 use crate::track::refinement::FrameRef;
 use splat_types::covariance::Covariance;
@@ -162,7 +163,7 @@ impl Tracker {
     /// The pose of a frame by what is known. Frames come in order of time.
     pub fn track(&mut self, frame: &Frame) -> TrackedFrame {
         let tracked = if repeats(self.last.as_ref(), frame) {
-            self.odometry.follow_wheels(frame);
+            self.odometry.follow_sensors(frame);
             self.repeated((frame.seq, frame.stamp))
         } else {
             self.look_at(frame)
@@ -176,7 +177,7 @@ impl Tracker {
         let linked = self.linked(frame.seq);
         let wheels = match linked {
             Some(_) => None,
-            None => self.linked_by_wheels(frame.seq),
+            None => self.linked_by_sensors((frame.seq, frame.stamp)),
         };
         let near = linked.as_ref().or(wheels.as_ref());
         if let Some(found) = self.found_by_points(frame, near, linked.is_none()) {
@@ -254,11 +255,6 @@ impl Tracker {
                 self.retry_frame(&oldest);
             }
         }
-    }
-
-    /// Whether odometry of the source disagrees with the camera and is left out.
-    pub fn is_odometry_out(&self) -> bool {
-        self.odometry.is_source_out()
     }
 
     /// Whether the pose of the last frame is in odometry's frame and unit, as there is no map yet.
@@ -382,53 +378,6 @@ impl Tracker {
             }
             self.anchor = Some(better);
         }
-    }
-
-    /// A frame where odometry says, among the keyframes as they stand now: from the last frame that was found by landmarks or from
-    /// the newest keyframe, whichever leaves the place more certain.
-    fn linked(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
-        self.surest(self.odometry.locate(seq), |found| {
-            self.odometry.motion(found, seq)
-        })
-    }
-
-    /// The same by the odometry that the source has.
-    fn linked_by_wheels(&self, seq: u64) -> Option<(LinkedPose, Rigid)> {
-        self.surest(self.odometry.locate_by_wheels(seq), |found| {
-            self.odometry.motion_by_wheels(found, seq)
-        })
-    }
-
-    /// A frame by where it is to a keyframe, or by the motion since the last frame that was found by landmarks.
-    fn surest(
-        &self,
-        of_key: Option<LinkedPose>,
-        since: impl Fn(u64) -> Option<LinkedMotion>,
-    ) -> Option<(LinkedPose, Rigid)> {
-        let by_key = || {
-            let mut linked = of_key?;
-            linked.covariance += self.localizer().covariance_of_key(&linked);
-            let (world_from_key, _) = self.keyframes.get(&linked.keyframe_id)?;
-            Some((linked, *world_from_key * linked.key_from_cam))
-        };
-        let by_frame = || {
-            let found = self.search.found.as_ref()?;
-            let motion = since(found.seq)?;
-            let world_from_cam = self.pose_by(&found.anchor)? * motion.earlier_from_later;
-            let (world_from_key, _) = self.keyframes.get(&found.anchor.keyframe_id)?;
-            let of_found = transported(&found.covariance, &motion.earlier_from_later.inverse());
-            let linked = LinkedPose {
-                keyframe_id: found.anchor.keyframe_id,
-                key_from_cam: world_from_key.inverse() * world_from_cam,
-                covariance: of_found + motion.covariance,
-                n_inliers: motion.n_inliers,
-            };
-            Some((linked, world_from_cam))
-        };
-        let both = [by_key(), by_frame()].into_iter().flatten();
-        both.min_by(|a, b| {
-            place_variance(&a.0.covariance).total_cmp(&place_variance(&b.0.covariance))
-        })
     }
 
     /// Whether odometry knows better than the landmarks where the camera is.

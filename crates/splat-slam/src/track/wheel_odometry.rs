@@ -7,23 +7,12 @@ use std::collections::VecDeque;
 
 use crate::track::anchor::Anchor;
 use crate::track::odometry_link::{LinkedMotion, OdometryLink};
+use crate::track::sensor_check::{self, COMPARED_SECS, MAX_COMPARED_SECS, SensorCheck};
 use crate::visual_odometry::odometry::OdometryPose;
 use splat_geometry::odometry_step::is_continuous;
 use splat_types::frame::Frame;
 use splat_types::time::Stamp;
 use splat_types::transform::Rigid;
-
-/// Motions over so many seconds are compared, and at most over so many.
-const COMPARED_SECS: f64 = 0.5;
-const MAX_COMPARED_SECS: f64 = 2.0;
-/// Standard deviations by which odometry may be off on average over its axes; and what a measured pose may be off by: radians, and
-/// as a share of the scene's depth.
-const MAX_MISFIT: f64 = 4.0;
-const MEASURED_TURN_STD: f64 = 0.004;
-const MEASURED_STD: f64 = 0.004;
-/// Seconds of disagreement after which odometry is out, and of agreement after which it is taken back.
-const OUT_AFTER_SECS: f64 = 0.8;
-const BACK_AFTER_SECS: f64 = 5.0;
 
 /// Poses by odometry, and how they lie in the map.
 #[derive(Debug, Default)]
@@ -32,7 +21,9 @@ pub(crate) struct WheelOdometry {
     last: Option<(Stamp, Rigid)>,
     /// Grows when odometry begins anew.
     segment: u32,
-    check: Check,
+    /// Frames of the last seconds.
+    measured: VecDeque<MeasuredFrame>,
+    check: SensorCheck,
 }
 
 /// A frame whose place was measured.
@@ -41,40 +32,6 @@ pub(crate) struct MeasuredFrame {
     pub(crate) seq: u64,
     pub(crate) stamp: Stamp,
     pub(crate) anchor: Anchor,
-}
-
-/// Whether odometry is believed.
-#[derive(Debug, Default)]
-struct Check {
-    measured: VecDeque<MeasuredFrame>,
-    /// Since when it has been otherwise than `is_out` says.
-    other_since: Option<Stamp>,
-    is_out: bool,
-}
-
-impl Check {
-    fn note(&mut self, stamp: Stamp, is_off: bool) {
-        if is_off == self.is_out {
-            self.other_since = None;
-            return;
-        }
-        let since = *self.other_since.get_or_insert(stamp);
-        let needed = if self.is_out {
-            BACK_AFTER_SECS
-        } else {
-            OUT_AFTER_SECS
-        };
-        if stamp.secs_since(since) >= needed {
-            (self.is_out, self.other_since) = (is_off, None);
-            if is_off {
-                tracing::warn!(
-                    "odometry disagrees with the camera since {since} and is left out until it agrees for {BACK_AFTER_SECS} s"
-                );
-            } else {
-                tracing::info!("odometry agrees with the camera again at {stamp}");
-            }
-        }
-    }
 }
 
 impl WheelOdometry {
@@ -106,7 +63,7 @@ impl WheelOdometry {
 
     /// Whether odometry has disagreed with what the map measured.
     pub(crate) fn is_out(&self) -> bool {
-        self.check.is_out
+        self.check.is_out()
     }
 
     /// One more frame whose place was measured; `pose_of` gives those of frames before by the map of this moment.
@@ -117,7 +74,7 @@ impl WheelOdometry {
         pose_of: impl Fn(&Anchor) -> Option<Rigid>,
     ) {
         let age = |other: &MeasuredFrame| frame.stamp.secs_since(other.stamp);
-        let measured = &mut self.check.measured;
+        let measured = &mut self.measured;
         while measured
             .front()
             .is_some_and(|first| !(0.0..MAX_COMPARED_SECS).contains(&age(first)))
@@ -131,22 +88,20 @@ impl WheelOdometry {
             Some(misfit(&motion, &measured, scene_depth))
         });
         if let Some(misfit) = compared {
-            self.check.note(frame.stamp, misfit > MAX_MISFIT);
+            self.check.note("odometry", frame.stamp, misfit);
         }
-        self.check.measured.push_back(frame);
+        self.measured.push_back(frame);
     }
 }
 
 /// By how many standard deviations two motions differ, the larger of place and turn.
 fn misfit(motion: &LinkedMotion, measured: &Rigid, scene_depth: f64) -> f64 {
-    let std = |axes: std::ops::Range<usize>, floor: f64| {
+    let std = |axes: std::ops::Range<usize>| {
         let variance = axes.map(|i| motion.covariance[(i, i)]).sum::<f64>() / 3.0;
-        (variance + floor * floor).sqrt()
+        variance.sqrt()
     };
-    let off = motion.earlier_from_later.inverse() * *measured;
-    let place = off.translation.length() / std(0..3, MEASURED_STD * scene_depth);
-    let turn = off.angle_to(&Rigid::IDENTITY) / std(3..6, MEASURED_TURN_STD);
-    place.max(turn) / 3.0_f64.sqrt()
+    let stds = (std(0..3), std(3..6));
+    sensor_check::misfit(&motion.earlier_from_later, stds, measured, scene_depth)
 }
 
 #[cfg(test)]

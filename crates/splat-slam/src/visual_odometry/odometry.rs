@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::DVec2;
+use glam::{DQuat, DVec2};
 
 use crate::select::motion::grey_of_size;
 use crate::select::optical_flow::Pyramid;
@@ -114,6 +114,16 @@ impl VisualOdometry {
 
     /// `camera`: that of the frame, for images of any size; a frame without one was taken by the last one.
     pub fn push(&mut self, frame: &Frame, camera: Option<&WorkingCamera>) -> OdometryFrame {
+        self.push_turned(frame, camera, |_| None)
+    }
+
+    /// The same where something has measured the turn since a frame before, `earlier_from_later`.
+    pub fn push_turned(
+        &mut self,
+        frame: &Frame,
+        camera: Option<&WorkingCamera>,
+        turn_since: impl Fn(Stamp) -> Option<DQuat>,
+    ) -> OdometryFrame {
         let grey = grey_of_size(&frame.image, MAX_PX);
         let size = (grey.width as u32, grey.height as u32);
         self.n_frames += 1;
@@ -121,7 +131,7 @@ impl VisualOdometry {
         let found = match self.camera {
             None => Err(OdometryState::NoCamera),
             Some(camera) => {
-                let expected = self.prediction(frame.stamp);
+                let expected = self.prediction(frame.stamp, &turn_since);
                 let running = match &self.stage {
                     Stage::Running(running) => Some(running),
                     Stage::Starting { .. } => None,
@@ -136,7 +146,7 @@ impl VisualOdometry {
                     });
                     Some(camera.distorted(at?)?.as_vec2().to_array())
                 });
-                self.pose(frame.stamp, &camera)
+                self.pose(frame.stamp, expected, &camera)
             }
         };
         OdometryFrame {
@@ -165,24 +175,34 @@ impl VisualOdometry {
         }
     }
 
-    /// Where the camera is if it goes on as it went.
-    fn prediction(&self, stamp: Stamp) -> Option<Rigid> {
+    /// Where the camera is if it goes on as it went, or turns as was measured.
+    fn prediction(
+        &self,
+        stamp: Stamp,
+        turn_since: impl Fn(Stamp) -> Option<DQuat>,
+    ) -> Option<Rigid> {
         let Stage::Running(running) = &self.stage else {
             return None;
         };
         let (at, pose) = running.last;
-        let Some((at_before, before)) = running.before else {
-            return Some(pose);
+        let on = running.before.map_or(pose, |(at_before, before)| {
+            let step = at.secs_since(at_before).max(1e-6);
+            let share = (stamp.secs_since(at) / step).clamp(0.0, MAX_AHEAD);
+            before.between(&pose, 1.0 + share)
+        });
+        let Some(turn) = turn_since(at) else {
+            return Some(on);
         };
-        let step = at.secs_since(at_before).max(1e-6);
-        let share = (stamp.secs_since(at) / step).clamp(0.0, MAX_AHEAD);
-        Some(before.between(&pose, 1.0 + share))
+        let place = on.inverse().translation;
+        let rotation = (turn.inverse() * pose.rotation).normalize();
+        Some(Rigid::new(rotation, -(rotation * place)))
     }
 
     /// The frame whose corners were followed last.
     fn pose(
         &mut self,
         stamp: Stamp,
+        expected: Option<Rigid>,
         camera: &WorkingCamera,
     ) -> Result<OdometryPose, OdometryState> {
         let seen: Vec<(u32, DVec2)> = self.seen(camera).collect();
@@ -207,7 +227,7 @@ impl VisualOdometry {
                     Err(NoStart::Lost) => Err(self.begin(camera)),
                 }
             }
-            Stage::Running(_) => self.locate(stamp, &seen),
+            Stage::Running(_) => self.locate(stamp, &expected.unwrap_or(Rigid::IDENTITY), &seen),
         }
     }
 
@@ -256,13 +276,13 @@ impl VisualOdometry {
     fn locate(
         &mut self,
         stamp: Stamp,
+        guess: &Rigid,
         seen: &[(u32, DVec2)],
     ) -> Result<OdometryPose, OdometryState> {
-        let guess = self.prediction(stamp).unwrap_or(Rigid::IDENTITY);
         let Stage::Running(running) = &mut self.stage else {
             return Err(OdometryState::Lost);
         };
-        let Some(found) = running.map.locate(seen, &guess, self.n_frames) else {
+        let Some(found) = running.map.locate(seen, guess, self.n_frames) else {
             if stamp.secs_since(running.last.0) > MAX_LOST_SECS {
                 self.restart();
             }

@@ -3,7 +3,7 @@ use rand_pcg::Pcg32;
 
 use super::*;
 use splat_types::inertial::ImuSample;
-use splat_types::inertial::ImuSpan;
+use splat_types::inertial::{ImuModel, ImuSpan};
 
 const RATE_HZ: f64 = 200.0;
 const METRES_PER_UNIT: f64 = 2.7;
@@ -111,7 +111,10 @@ impl Way {
         let mut log = ImuLog::new(1e3);
         log.push(&ImuSpan {
             samples: (-40..n + 40).map(sample).collect(),
-            imu_in_cam: LEVER,
+            model: ImuModel {
+                imu_in_cam: LEVER,
+                ..ImuModel::default()
+            },
         });
         log
     }

@@ -243,7 +243,7 @@ fn all_of_few_photos_are_keyframes_but_not_the_same_one_again() {
 #[test]
 fn a_keyframe_has_what_an_imu_measured_since_the_keyframe_before() {
     use glam::DVec3;
-    use splat_types::inertial::{ImuSample, ImuSpan};
+    use splat_types::inertial::{ImuModel, ImuSample, ImuSpan};
     let sample = |millis: i64| ImuSample {
         stamp: Stamp::from_nanos(millis * 1_000_000),
         angular_velocity: DVec3::ZERO,
@@ -255,7 +255,7 @@ fn a_keyframe_has_what_an_imu_measured_since_the_keyframe_before() {
         let mut frame = frame(seq, 8.0 * seq as f64, 1.0);
         frame.imu = Some(ImuSpan {
             samples: millis.step_by(10).map(sample).collect(),
-            imu_in_cam: DVec3::X,
+            model: ImuModel::default(),
         });
         frame
     };

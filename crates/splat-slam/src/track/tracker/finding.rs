@@ -51,7 +51,10 @@ impl Tracker {
         let ahead = || {
             let motion = self.motion.as_ref();
             let motion = motion.filter(|_| self.state != TrackState::Lost);
-            motion.map(|motion| motion.ahead(frame.stamp))
+            motion.map(|motion| {
+                let turn = self.odometry.inertial.turn(motion.stamp, frame.stamp);
+                motion.ahead_turned(frame.stamp, turn)
+            })
         };
         let near = guess.or_else(ahead).and_then(|guess| self.aligned(&guess));
         match near {

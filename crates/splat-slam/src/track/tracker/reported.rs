@@ -52,7 +52,7 @@ impl Tracker {
             let (depth, keyframes) = (self.scene_depth(), &self.keyframes);
             let measured = MeasuredFrame { seq, stamp, anchor };
             self.odometry
-                .compare(measured, depth, |anchor| keyframes.pose_by(anchor));
+                .measured(measured, depth, |anchor| keyframes.pose_by(anchor));
         }
         let points = found.points.as_deref().zip(self.odometry.newest());
         if let Some((points, frame)) = points {
@@ -101,12 +101,26 @@ impl Tracker {
         self.odometry.registered_in_map();
         let is_new = self.state == TrackState::Lost;
         let anchor = linked.anchor(self.keyframes.unit(linked.keyframe_id));
+        let measured = MeasuredFrame {
+            seq: frame.0,
+            stamp: frame.1,
+            anchor,
+        };
+        self.note_for_imu(measured);
         let pose = (
             world_from_cam.inverse(),
             linked.covariance,
             linked.n_inliers,
         );
         self.measured(frame, pose, anchor, is_new)
+    }
+
+    fn note_for_imu(&mut self, frame: MeasuredFrame) {
+        let (depth, keyframes) = (self.scene_depth(), &self.keyframes);
+        let inertial = &mut self.odometry.inertial;
+        if inertial.has_come() {
+            inertial.measured(frame, depth, |anchor| keyframes.pose_by(anchor));
+        }
     }
 
     /// The image shows nothing that could be found, but odometry of the source has gone on. As long as it is sure enough, nothing is
@@ -185,7 +199,7 @@ impl Tracker {
     /// The image of the frame before has come again.
     pub(super) fn repeated(&mut self, frame: (u64, Stamp)) -> TrackedFrame {
         let reason = LostReason::Repeated;
-        if let Some(linked) = self.linked_by_wheels(frame.0) {
+        if let Some(linked) = self.linked_by_sensors(frame) {
             return self.bridged(frame, None, reason, &linked);
         }
         let tracked = if self.motion.is_some() {
