@@ -13,7 +13,7 @@ use crate::inertial::place_filter::{
     FORCE_BIAS, GRAVITY_AT, N, PLACE, SPEED, Solution, UNITS, solve, step_covariance,
 };
 use crate::inertial::preintegration::{Bias, Preintegrated};
-use crate::inertial::turns::{self, TurnAlignment, TurnPair};
+use crate::inertial::turns::{self, MeasuredTurn, TurnAlignment, TurnPair};
 use splat_types::inertial::ImuLog;
 use splat_types::time::Stamp;
 use splat_types::transform::{Rigid, skew};
@@ -207,30 +207,23 @@ fn align_turns(
 fn turn_pairs(frames: &[PosedFrame], motions: &[Option<Preintegrated>]) -> Vec<TurnPair> {
     let mut pairs = Vec::new();
     let mut first = 0;
-    let mut so_far: Option<(DQuat, DMat3, f64, DVec3)> = None;
+    let mut so_far: Option<MeasuredTurn> = None;
     for (ix, motion) in motions.iter().enumerate() {
         let Some(motion) = motion else {
             (first, so_far) = (ix + 1, None);
             continue;
         };
-        let (turn, by_gyro, variance, rate) =
-            so_far.unwrap_or((DQuat::IDENTITY, DMat3::ZERO, 0.0, motion.rates[0]));
-        let back = DMat3::from_quat(motion.turn.inverse());
-        let turn = turn * motion.turn;
-        let by_gyro = back * by_gyro + motion.turn_by_gyro;
-        let variance = variance + motion.turn_variance();
+        let step = MeasuredTurn::of(motion);
+        let measured = so_far.map_or(step, |so_far| so_far.then(&step));
         let [a, b] = [&frames[first], &frames[ix + 1]];
         if b.stamp.secs_since(a.stamp) < TURN_SECS {
-            so_far = Some((turn, by_gyro, variance, rate));
+            so_far = Some(measured);
             continue;
         }
         pairs.push(TurnPair {
             seen: a.world_from_cam.rotation.inverse() * b.world_from_cam.rotation,
             seen_std: a.std[1].hypot(b.std[1]),
-            turn,
-            turn_by_gyro: by_gyro,
-            turn_variance: variance,
-            rates: [rate, motion.rates[1]],
+            measured,
         });
         (first, so_far) = (ix + 1, None);
     }

@@ -28,6 +28,11 @@ const MAX_PASSES: usize = 6;
 const SAME_UNIT: f64 = 0.02;
 /// Gravity is known to such a share.
 const GRAVITY_ERROR: f64 = 0.003;
+/// A unit that is known worse is not corrected; others are tried at least so far away; and a unit that is tried is as good as fixed.
+const MAX_CORRECTED_STD: f64 = 0.1;
+const MIN_STEP: f64 = 0.004;
+const UNIT_WEIGHT: f64 = 1e5;
+
 /// Values of all unknowns at the last frame, in units.
 #[derive(Debug, Clone)]
 pub(crate) struct Solution {
@@ -58,7 +63,8 @@ pub(crate) fn solve(
     let mut units = first_units(frames);
     for _ in 0..MAX_PASSES {
         let found = pass(frames, motions, (lever, units), noise);
-        let (values, covariance) = with_gravity(&found, units)?;
+        let with = with_gravity(&found, units)?;
+        let (values, covariance) = with.solve()?;
         let next = values[UNITS];
         if next.is_nan() || next <= 0.0 {
             return None;
@@ -68,14 +74,44 @@ pub(crate) fn solve(
         if is_same {
             // Noise that is larger than stated widens everything.
             let variance = found.variance();
+            let covariance = covariance * variance.max(1.0);
+            let std = covariance[(UNITS, UNITS)].sqrt() / units;
+            let best = (std < MAX_CORRECTED_STD)
+                .then(|| without_attenuation(frames, motions, (lever, units, std), noise));
             return Some(Solution {
-                values,
-                covariance: covariance * variance.max(1.0),
+                values: best.flatten().unwrap_or(values),
+                covariance,
                 misfit: variance.sqrt(),
             });
         }
     }
     None
+}
+
+/// The values with the unit that total least squares gives. Forces are what the unit is multiplied with, and their noise makes plain least
+/// squares find it too small, as in any regression on what is measured with noise: minimal is the sum of the squares whose weights
+/// follow the unit that is tried (Golub and Van Loan 1980; Deming's regression).
+fn without_attenuation(
+    frames: &[PosedFrame],
+    motions: &[Option<Preintegrated>],
+    (lever, units, std): (DVec3, f64, f64),
+    noise: &ImuNoise,
+) -> Option<DVector<f64>> {
+    let with_unit = |units: f64| {
+        let mut known = pass(frames, motions, (lever, units), noise);
+        let mut unit = DMatrix::zeros(1, N + 1);
+        (unit[(0, UNITS)], unit[(0, N)]) = (UNIT_WEIGHT / units, UNIT_WEIGHT);
+        known.add(&unit);
+        with_gravity(&known, units)
+    };
+    let step = std.max(MIN_STEP);
+    let squares = |off: f64| Some(with_unit(units * off.exp())?.squares);
+    let (below, middle, above) = (squares(-step)?, squares(0.0)?, squares(step)?);
+    let bend = above + below - 2.0 * middle;
+    let off = 0.5 * step * (below - above) / bend;
+    let is_minimum = bend > 0.0 && off.abs() < 2.0 * step;
+    let best = with_unit(units * if is_minimum { off.exp() } else { 1.0 })?;
+    Some(best.solve()?.0)
 }
 
 /// Units per metre of a hand or a robot that moves by half a metre in a second.
@@ -190,17 +226,18 @@ pub(crate) fn step_covariance(
 }
 
 /// Solves with the length of gravity, which is units per metre times 9.81: a condition that is not linear, so a few times.
-fn with_gravity(found: &Information, units: f64) -> Option<(DVector<f64>, DMatrix<f64>)> {
-    let (mut values, mut covariance) = found.solve()?;
+fn with_gravity(found: &Information, units: f64) -> Option<Information> {
+    let (mut values, _) = found.solve()?;
+    let mut with = found.clone();
     for _ in 0..4 {
         let direction = vector(&values, GRAVITY_AT).try_normalize()?;
         let weight = 1.0 / (GRAVITY_ERROR * GRAVITY * units);
         let mut row = DMatrix::zeros(1, N + 1);
         (0..3).for_each(|i| row[(0, GRAVITY_AT + i)] = weight * direction[i]);
         row[(0, UNITS)] = -weight * GRAVITY;
-        let mut with = found.clone();
+        with = found.clone();
         with.add(&row);
-        (values, covariance) = with.solve()?;
+        (values, _) = with.solve()?;
     }
-    Some((values, covariance))
+    Some(with)
 }

@@ -8,6 +8,7 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{SMatrix, SVector};
 
 use crate::inertial::noise::ImuNoise;
+use crate::inertial::preintegration::Preintegrated;
 use crate::stats::median;
 
 /// Standard deviations of what is believed before: turn of the mount in radians, delay in seconds.
@@ -21,6 +22,56 @@ const MIN_TURNS: usize = 3;
 
 type Normal = SMatrix<f64, 7, 7>;
 
+/// A turn by a gyroscope between two times.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredTurn {
+    pub secs: f64,
+    /// `first_from_second`.
+    pub turn: DQuat,
+    /// A small turn in the axes of the second time by the bias.
+    pub by_gyro: DMat3,
+    /// About each axis, rad^2.
+    pub variance: f64,
+    /// Rates at both times, rad/s.
+    pub rates: [DVec3; 2],
+}
+
+impl MeasuredTurn {
+    pub fn of(motion: &Preintegrated) -> Self {
+        Self {
+            secs: motion.secs,
+            turn: motion.turn,
+            by_gyro: motion.turn_by_gyro,
+            variance: motion.turn_variance(),
+            rates: motion.rates,
+        }
+    }
+
+    /// This turn and then the next one.
+    #[must_use]
+    pub fn then(&self, next: &Self) -> Self {
+        let back = DMat3::from_quat(next.turn.inverse());
+        Self {
+            secs: self.secs + next.secs,
+            turn: (self.turn * next.turn).normalize(),
+            by_gyro: back * self.by_gyro + next.by_gyro,
+            variance: self.variance + next.variance,
+            rates: [self.rates[0], next.rates[1]],
+        }
+    }
+
+    /// With another bias, mount and delay.
+    pub fn corrected(&self, gyro_bias: DVec3, mount: DVec3, delay_secs: f64) -> DQuat {
+        let by_bias = DQuat::from_scaled_axis(self.by_gyro * gyro_bias);
+        let mount = DQuat::from_scaled_axis(mount);
+        // A delay moves both ends, by the rates there.
+        let ends = self
+            .rates
+            .map(|rate| DQuat::from_scaled_axis(rate * delay_secs));
+        mount * ends[0].inverse() * (self.turn * by_bias) * ends[1] * mount.inverse()
+    }
+}
+
 /// A turn between two times, by the images and by the gyroscope.
 #[derive(Debug, Clone)]
 pub struct TurnPair {
@@ -28,12 +79,7 @@ pub struct TurnPair {
     pub seen: DQuat,
     /// Standard deviation about each axis, rad.
     pub seen_std: f64,
-    /// The same by the gyroscope, its derivative by the bias, and its variance about each axis.
-    pub turn: DQuat,
-    pub turn_by_gyro: DMat3,
-    pub turn_variance: f64,
-    /// Rates at both times, rad/s.
-    pub rates: [DVec3; 2],
+    pub measured: MeasuredTurn,
 }
 
 /// What turns show of a gyroscope.
@@ -105,23 +151,19 @@ impl TurnPair {
     /// What is left of the turn with (bias, mount, delay), the slope of what they explain, and the residual's standard deviation.
     fn linearised(&self, at: &SVector<f64, 7>) -> (DVec3, SMatrix<f64, 3, 7>, f64) {
         let vector = |i: usize| DVec3::new(at[i], at[i + 1], at[i + 2]);
-        let (bias, mount, delay) = (vector(0), vector(3), at[6]);
-        let by_bias = DQuat::from_scaled_axis(self.turn_by_gyro * bias);
-        let mount = DQuat::from_scaled_axis(mount);
-        // A delay moves both ends, by the rates there.
-        let ends = self.rates.map(|rate| DQuat::from_scaled_axis(rate * delay));
-        let turn = mount * ends[0].inverse() * (self.turn * by_bias) * ends[1] * mount.inverse();
+        let measured = &self.measured;
+        let turn = measured.corrected(vector(0), vector(3), at[6]);
         let off = turn.inverse() * self.seen;
         let off = if off.w < 0.0 { -off } else { off };
         let residual = off.to_scaled_axis();
         // To first order of small residuals, which is enough to converge by.
         let back = DMat3::from_quat(turn.inverse());
         let by_mount = back - DMat3::IDENTITY;
-        let by_delay = self.rates[1] - back * self.rates[0];
+        let by_delay = measured.rates[1] - back * measured.rates[0];
         let mut slope = SMatrix::<f64, 3, 7>::zeros();
         for row in 0..3 {
             for column in 0..3 {
-                slope[(row, column)] = self.turn_by_gyro.col(column)[row];
+                slope[(row, column)] = measured.by_gyro.col(column)[row];
                 slope[(row, 3 + column)] = by_mount.col(column)[row];
             }
             slope[(row, 6)] = by_delay[row];
@@ -129,7 +171,7 @@ impl TurnPair {
         (
             residual,
             slope,
-            (self.seen_std.powi(2) + self.turn_variance).sqrt(),
+            (self.seen_std.powi(2) + measured.variance).sqrt(),
         )
     }
 }

@@ -5,6 +5,7 @@ use splat_geometry::inertial::alignment::{MetricAlignment, align};
 use splat_geometry::inertial::frames::{Calibration, PosedFrame};
 use splat_geometry::inertial::noise::ImuNoise;
 use splat_geometry::length_ratio::LogRatio;
+use splat_geometry::similarity;
 use splat_geometry::stats::median;
 use splat_types::inertial::ImuLog;
 use splat_types::snapshot::KeyframePose;
@@ -30,7 +31,7 @@ pub(crate) fn metres_per_unit<'a>(
 ) -> Option<LogRatio> {
     let newest: Vec<&RegisteredKeyframe> = registered.rev().take(MAX_KEYFRAMES).collect();
     let mut log = ImuLog::new(KEPT_SECS);
-    let mut frames = Vec::new();
+    let (mut frames, mut pairs) = (Vec::new(), Vec::new());
     for keyframe in newest.iter().rev() {
         let frame = &keyframe.keyframe.frame;
         let Some(span) = &frame.imu else {
@@ -38,16 +39,20 @@ pub(crate) fn metres_per_unit<'a>(
         };
         log.push(span);
         if let Ok(ix) = poses.binary_search_by_key(&frame.stamp, |p| p.stamp) {
+            // Steps of the splats shake poses by more than geometry is off from one keyframe to the next.
+            let world_from_cam = keyframe.submap_from_cam;
             frames.push(PosedFrame {
                 stamp: frame.stamp,
-                world_from_cam: poses[ix].world_from_cam,
+                world_from_cam,
                 std: [0.0, TURN_STD],
             });
+            pairs.push((poses[ix].world_from_cam, world_from_cam));
         }
     }
+    let map_per_model = similarity::of_poses(&pairs)?.scale;
     let found = by_own_misfit(&mut frames, &log)?;
     (found.misfit < MAX_MISFIT && found.has_unit()).then(|| LogRatio {
-        log: found.metres_per_unit.ln(),
+        log: (found.metres_per_unit / map_per_model).ln(),
         std: found.relative_std.hypot(COMMON_ERROR),
     })
 }

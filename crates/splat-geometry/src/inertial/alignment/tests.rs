@@ -322,3 +322,25 @@ fn gaps_leave_what_is_known_before_and_after() {
     let empty = align(&way.frames(), &none, &Calibration::default(), &way.noise());
     assert_eq!(empty.err(), Some(Unaligned::Gaps));
 }
+
+/// Noise of forces, without any of places, makes plain regression find the unit too large.
+#[test]
+fn a_noisy_accelerometer_does_not_bias_the_unit() {
+    const N: u64 = 16;
+    let (mut mean, mut squares) = (0.0, 0.0);
+    for seed in 0..N {
+        let way = Way {
+            noise: 6.0,
+            seen_std: [0.001, 0.0003],
+            seed: 10 * seed + 7,
+            secs: 12.0,
+            ..Way::default()
+        };
+        let found = way.aligned().unwrap();
+        let unit = (metric(&found).metres_per_unit / METRES_PER_UNIT).ln();
+        mean += unit / N as f64;
+        squares += (unit / metric(&found).relative_std).powi(2) / N as f64;
+    }
+    assert!(mean.abs() < 0.01, "off by {mean} in the mean");
+    assert!((0.3..2.5).contains(&squares), "{squares}");
+}

@@ -27,10 +27,10 @@ fn slopes_are_central_differences() {
     let pair = |seen: DQuat| TurnPair {
         seen,
         seen_std: 1e-3,
-        turn: motion.turn,
-        turn_by_gyro: motion.turn_by_gyro,
-        turn_variance: motion.turn_variance(),
-        rates,
+        measured: MeasuredTurn {
+            rates,
+            ..MeasuredTurn::of(&motion)
+        },
     };
     let at = SVector::<f64, 7>::zeros();
     let (_, slope, _) = pair(motion.turn).linearised(&at);
@@ -70,10 +70,10 @@ fn bias_mount_and_delay_come_of_exact_turns() {
             TurnPair {
                 seen: mount * own * mount.inverse(),
                 seen_std: 1e-5,
-                turn: motion.turn,
-                turn_by_gyro: motion.turn_by_gyro,
-                turn_variance: motion.turn_variance(),
-                rates: *rates,
+                measured: MeasuredTurn {
+                    rates: *rates,
+                    ..MeasuredTurn::of(motion)
+                },
             }
         })
         .collect();
