@@ -10,7 +10,7 @@ use nalgebra::SMatrix;
 use crate::inertial::frames::{Calibration, PosedFrame, integrated};
 use crate::inertial::noise::{GRAVITY, ImuNoise};
 use crate::inertial::place_filter::{
-    FORCE_BIAS, GRAVITY_AT, N, PLACE, SPEED, Solution, UNITS, solve, step_covariance,
+    FORCE_BIAS, GRAVITY_AT, N, PLACE, SPEED, Solution, UNITS, solve, step_covariance, unit_scatter,
 };
 use crate::inertial::preintegration::{Bias, Preintegrated};
 use crate::inertial::turns::{self, MeasuredTurn, TurnAlignment, TurnPair};
@@ -35,6 +35,8 @@ const NEAR_MOUNT: f64 = 1e-3;
 const NEAR_DELAY_SECS: f64 = 5e-4;
 /// Of cameras on hands and robots, m/s.
 const MAX_SPEED: f64 = 1.0;
+/// Frames that lie further apart in time are not tied to each other.
+const MAX_STEP_SECS: f64 = 2.0;
 /// The last turns that give the turn of the last frame, by the gyroscope in between.
 const SMOOTHED_SECS: f64 = 0.5;
 
@@ -137,7 +139,9 @@ pub fn align(
         ..turns
     };
     let lever = DQuat::from_scaled_axis(calibration.mount) * log.model().imu_in_cam;
-    let metric = solve(frames, &motions, lever, noise).map(MetricAlignment::of);
+    let solution = solve(frames, &motions, lever, noise);
+    let scatter = |units: f64| unit_scatter(frames, &motions, (lever, units), noise);
+    let metric = solution.map(|solution| MetricAlignment::of(solution, scatter));
     if let Some(metric) = &metric {
         let bias = metric.solution.vector(FORCE_BIAS);
         calibration.bias.accelerometer = bias * metric.metres_per_unit;
@@ -239,6 +243,10 @@ fn motions(
 ) -> Result<Vec<Option<Preintegrated>>, Unaligned> {
     let between = |two: &[PosedFrame]| {
         let times = (two[0].stamp, two[1].stamp);
+        // Longer ones say less than their noise: biases are not exact either.
+        if times.1.secs_since(times.0) > MAX_STEP_SECS {
+            return None;
+        }
         integrated(log, calibration, times, noise)
     };
     let motions: Vec<_> = frames.windows(2).map(between).collect();
@@ -282,11 +290,12 @@ fn smoothed_turn(
 }
 
 impl MetricAlignment {
-    fn of(solution: Solution) -> Self {
+    fn of(solution: Solution, scatter: impl Fn(f64) -> f64) -> Self {
         let units = solution.values[UNITS];
+        let std = solution.covariance[(UNITS, UNITS)].sqrt() / units;
         Self {
             metres_per_unit: 1.0 / units,
-            relative_std: solution.covariance[(UNITS, UNITS)].sqrt() / units,
+            relative_std: std.max(scatter(units)),
             misfit: solution.misfit,
             solution,
         }

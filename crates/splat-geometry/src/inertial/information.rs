@@ -37,7 +37,8 @@ impl Information {
         self.reduce(stacked);
     }
 
-    /// The first `m` unknowns become others: `rows` hold the old ones, then the new ones, then the rest, then the value.
+    /// The first `m` unknowns become others: `rows` hold the old ones, then the new ones, then the rest, then the value. Something must be
+    /// known of each old one, be it little, by the rows so far or by these.
     pub(crate) fn replace_first(&mut self, m: usize, rows: &DMatrix<f64>) {
         let (n, more) = (self.n, rows.nrows());
         let mut stacked = DMatrix::zeros(n + more, n + m + 1);

@@ -318,6 +318,20 @@ fn gaps_leave_what_is_known_before_and_after() {
             .abs()
             < 0.015
     );
+    // Several in a row, and one at the end.
+    let is_there = |s: &ImuSample| !(5.0..8.0).contains(&s.stamp.secs()) && s.stamp.secs() < 13.0;
+    let whole = way.log(way.secs + 2.0).span();
+    let mut log = ImuLog::new(1e3);
+    log.push(&ImuSpan {
+        samples: whole.samples.iter().copied().filter(is_there).collect(),
+        ..whole
+    });
+    let found = align(&way.frames(), &log, &Calibration::default(), &way.noise()).unwrap();
+    let unit = (metric(&found).metres_per_unit / METRES_PER_UNIT).ln();
+    assert!(
+        unit.abs() < 3.0 * metric(&found).relative_std && unit.abs() < 0.03,
+        "{found:?}"
+    );
     let none = ImuLog::new(10.0);
     let empty = align(&way.frames(), &none, &Calibration::default(), &way.noise());
     assert_eq!(empty.err(), Some(Unaligned::Gaps));
