@@ -7,6 +7,7 @@ use glam::{DVec2, DVec3};
 use crate::optim::bundle::adjust;
 use crate::optim::bundle::problem::{Camera, Observation, Problem, Settings};
 use crate::optim::pose_covariance::pose_information;
+use crate::sfm::gyroscope;
 use crate::sfm::landmarks::filter;
 use crate::sfm::limits::Limits;
 use crate::sfm::metric_submap::make_metric;
@@ -272,6 +273,9 @@ fn problem(
     if let Some(submap) = submap {
         let camera = |view: usize| camera_of.get(&(view as u32)).copied();
         problem.motions = motions(scene, submap, camera);
+        problem
+            .motions
+            .extend(gyroscope::motions(scene, submap, camera));
     }
     (problem, views)
 }

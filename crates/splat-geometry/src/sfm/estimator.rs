@@ -17,6 +17,7 @@ use crate::sfm::close_loops::{release_waiting, settle};
 use crate::sfm::dense_depth::{Densifier, NextDepth};
 use crate::sfm::finder::{Finder, Found};
 use crate::sfm::global_adjustment::{AdjustedSubmap, GlobalAdjustment};
+use crate::sfm::gyroscope::turn_since;
 use crate::sfm::initialize::{Start, start};
 use crate::sfm::join_submaps::join_by_odometry;
 use crate::sfm::limits::Limits;
@@ -358,6 +359,7 @@ impl Sfm {
             is_calibrated: known.is_some(),
             registered: None,
             measured,
+            gyro: turn_since(self.scene.views.last(), keyframe),
             landmark_of: vec![NONE; found.len()],
             matched: vec![Vec::new(); found.len()],
             failed_with: 0,

@@ -6,6 +6,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::pnp;
 use crate::sfm::adjust::{adjust_global, median_error_px};
+use crate::sfm::gyroscope;
 use crate::sfm::landmarks::extend;
 use crate::sfm::limits::Limits;
 use crate::sfm::odometry::{MAX_MISFIT, turn_misfit, world_from_cam};
@@ -108,7 +109,7 @@ pub(crate) fn start(
             break;
         }
     }
-    prefer_by_odometry(scene, &mut found);
+    prefer_by_turns(scene, &mut found);
     let best = found.iter().max_by_key(|candidate| candidate.n_explained);
     let again = best
         .filter(|best| !found.iter().any(|other| other.contradicts(best)))
@@ -151,10 +152,11 @@ fn turned_between(a: &BTreeMap<usize, Rigid>, b: &BTreeMap<usize, Rigid>) -> f64
     both.map(off).fold(0.0, f64::max)
 }
 
-/// Of starts that say different things, those remain whose turns are the ones of odometry, if there are any.
-fn prefer_by_odometry(scene: &Reconstruction, found: &mut Vec<Candidate>) {
+/// Of starts that say different things, those remain whose turns are the ones of odometry, else of a gyroscope, if there are any.
+fn prefer_by_turns(scene: &Reconstruction, found: &mut Vec<Candidate>) {
     let agrees = |candidate: &Candidate| {
-        let misfit = turn_misfit(scene, &candidate.poses);
+        let by_odometry = turn_misfit(scene, &candidate.poses);
+        let misfit = by_odometry.or_else(|| gyroscope::turn_misfit(scene, &candidate.poses));
         misfit.is_some_and(|misfit| misfit <= MAX_MISFIT)
     };
     if found.iter().any(agrees) {

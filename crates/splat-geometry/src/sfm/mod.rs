@@ -16,6 +16,8 @@ mod metric_submap;
 
 mod odometry;
 
+mod gyroscope;
+
 mod overlap;
 
 mod landmarks;

@@ -9,6 +9,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::features::descriptor::Features;
+use crate::inertial::turns::MeasuredTurn;
 use crate::matching::PreparedDescriptors;
 use crate::optim::bundle::problem::MeasuredDepth;
 use crate::sfm::feature_depths::FeatureDepths;
@@ -39,6 +40,8 @@ pub(crate) struct SfmView {
     pub(crate) registered: Option<RegisteredView>,
     /// What a sensor measured at the features; `None` where none did, or what it says is not believed.
     pub(crate) measured: Option<FeatureDepths>,
+    /// How a gyroscope turned since the view before.
+    pub(crate) gyro: Option<MeasuredTurn>,
     /// Landmark of each feature, or `NONE`.
     pub(crate) landmark_of: Vec<u32>,
     /// For each feature its verified matches: (view, feature).
