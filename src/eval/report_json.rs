@@ -81,6 +81,9 @@ pub struct FrameCounts {
     /// That no image of the second camera belongs to, of a stereo pair.
     #[serde(default)]
     pub without_second: u64,
+    /// That no samples of the IMU reach, of a source that has one.
+    #[serde(default)]
+    pub without_imu: u64,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -255,6 +258,7 @@ impl FrameCounts {
             out_of_order,
             without_depth,
             without_second,
+            without_imu,
             dropped: missed,
             ..
         } = *counts;
@@ -265,6 +269,7 @@ impl FrameCounts {
             out_of_order,
             without_depth,
             without_second,
+            without_imu,
         }
     }
 }

@@ -38,6 +38,7 @@ frames.out_of_order
 frames.received
 frames.undecodable
 frames.without_depth
+frames.without_imu
 frames.without_second
 geometry_note
 keyframes.before
@@ -128,6 +129,7 @@ pub(crate) fn sample_report() -> Report {
             out_of_order: 0,
             without_depth: 0,
             without_second: 0,
+            without_imu: 0,
         },
         keyframes: KeyframeCounts {
             selected: 38,

@@ -12,13 +12,15 @@ use zenoh::{Session, Wait};
 use crate::over_zenoh::{PATIENCE, client, free_endpoint};
 use crate::scenes::scene;
 use splat_msgs::type_hash::dds_name;
+use splat_synth::record::write_recording;
+use splat_synth::settings::{SceneKind, SynthSettings};
 use splat_types::time::Stopwatch;
 
 const N_FRAMES: usize = 60;
 const IMAGES: &str = "/camera/image_raw/compressed";
 
 /// Sends the messages of a recording as they were recorded, up to so many images. Any hash will do.
-fn send(session: &Session, bag: &Path) {
+fn send(session: &Session, bag: &Path, n: usize) {
     let bytes = std::fs::read(bag).unwrap();
     let key = |topic: &str, type_name: &str| format!("0{topic}/{}/RIHS01_00", dds_name(type_name));
     let images = session.declare_publisher(key(IMAGES, "sensor_msgs/msg/CompressedImage"));
@@ -32,7 +34,7 @@ fn send(session: &Session, bag: &Path) {
     for message in mcap::MessageStream::new(&bytes).unwrap() {
         let message = message.unwrap();
         let at = Duration::from_nanos(message.log_time);
-        let due = at - *first.get_or_insert(at);
+        let due = at.saturating_sub(*first.get_or_insert(at));
         std::thread::sleep(due.saturating_sub(watch.elapsed()));
         let topic = &message.channel.topic;
         if topic.starts_with("/ground_truth") {
@@ -46,7 +48,7 @@ fn send(session: &Session, bag: &Path) {
             .wait()
             .unwrap();
         n_images += usize::from(topic == IMAGES);
-        if n_images > N_FRAMES {
+        if n_images > n {
             break;
         }
     }
@@ -71,7 +73,7 @@ fn a_depth_camera_over_zenoh_is_mapped_in_metres() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    send(&session, &scene.join("rosbag2/rosbag2.mcap"));
+    send(&session, &scene.join("rosbag2/rosbag2.mcap"), N_FRAMES);
     let output = mapper.wait_with_output().unwrap();
     let log = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{log}");
@@ -90,6 +92,46 @@ fn a_depth_camera_over_zenoh_is_mapped_in_metres() {
     assert_eq!(report["scale"]["source"], "depth");
     let metres = report["scale"]["metres_per_unit"].as_f64().unwrap();
     assert!((metres - 1.0).abs() < 0.02, "{metres}");
+}
+
+/// One camera and an IMU, which its parameter names: the map is in metres by what the IMU measured.
+#[test]
+fn an_imu_over_zenoh_gives_the_scale() {
+    let folder = tempfile::tempdir().unwrap();
+    let bag = folder.path().join("room.mcap");
+    let settings = SynthSettings {
+        n_frames: 130,
+        width_px: 320,
+        height_px: 240,
+        imu: Some(1.0),
+        depth: false,
+        ..SynthSettings::of(SceneKind::Room)
+    };
+    write_recording(&settings, &bag).unwrap();
+    let endpoint = free_endpoint();
+    let session = client(&endpoint, "");
+    let mapper = Command::new(env!("CARGO_BIN_EXE_splat-mapper"))
+        .args(["run", "--source", "zenoh:/camera/image_raw"])
+        .args(["--set", &format!("publish.zenoh_connect={endpoint}")])
+        .args(["--set", "publish.scouting=false"])
+        .args(["--set", "source.imu_topic=/imu/data_raw"])
+        .args(["--set", "source.max_frames=120"])
+        .args(["--set", "map.finish_secs=0", "--out"])
+        .arg(folder.path().join("out"))
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    send(&session, &bag, 125);
+    let output = mapper.wait_with_output().unwrap();
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{log}");
+    let report = std::fs::read(folder.path().join("out/report.json")).unwrap();
+    let report: Value = serde_json::from_slice(&report).unwrap();
+    let without = report["frames"]["without_imu"].as_u64().unwrap();
+    assert!(without <= 6, "{without} frames without samples: {log}");
+    assert_eq!(report["scale"]["source"], "imu", "{log}");
+    let [metres, std] = ["metres_per_unit", "std"].map(|of| report["scale"][of].as_f64().unwrap());
+    assert!(std < 0.05 * metres, "{metres} +- {std}");
 }
 
 #[test]

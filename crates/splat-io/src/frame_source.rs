@@ -23,6 +23,8 @@ pub struct SourceCounts {
     pub without_depth: u64,
     /// Frames that no image of the second camera belongs to, of a stereo pair.
     pub without_second: u64,
+    /// Frames that no samples of the IMU reach, of a source that has one.
+    pub without_imu: u64,
     /// Times that a camera stopped and was opened again.
     pub interruptions: u64,
     /// The fault that ended the input early, for example a truncated recording. Frames before it stay in use.

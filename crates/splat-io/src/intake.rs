@@ -108,6 +108,11 @@ impl Intake {
         self.counts.without_second += 1;
     }
 
+    /// The frame that comes next goes without samples of the IMU.
+    pub fn without_imu(&mut self) {
+        self.counts.without_imu += 1;
+    }
+
     /// The camera stopped and will be opened again.
     pub fn interrupted(&mut self) {
         self.counts.interruptions += 1;

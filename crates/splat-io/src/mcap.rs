@@ -26,6 +26,7 @@ use splat_msgs::ros::{self, CompressedImage, Image};
 use splat_types::depth::DepthMap;
 use splat_types::frame::{Frame, SecondImage};
 use splat_types::image::RgbImage;
+use splat_types::inertial::ImuSpan;
 use splat_types::time::Stamp;
 
 /// Images, and depth maps, that wait for each other: their messages may lie so far apart in the recording.
@@ -295,11 +296,7 @@ impl McapSource {
         let truth = self.truth.at(arrival.stamp, self.truth_within_nanos);
         let sensor_depth = self.depth_at(arrival.stamp);
         let second = self.second_at(arrival.stamp);
-        let imu = self.topics.imu.as_ref();
-        let imu = imu.and_then(|topic| {
-            let waiting = &mut self.queues.imu;
-            waiting.take_until(arrival.stamp, &topic.mounted)
-        });
+        let imu = self.imu_until(arrival.stamp);
         self.intake.frame(
             arrival,
             image,
@@ -334,6 +331,16 @@ impl McapSource {
         }
         self.intake.without_depth();
         None
+    }
+
+    /// What the IMU measured since the image before. Images without it are counted.
+    fn imu_until(&mut self, stamp: Stamp) -> Option<ImuSpan> {
+        let topic = self.topics.imu.as_ref()?;
+        let span = self.queues.imu.take_until(stamp, &topic.mounted);
+        if span.is_none() {
+            self.intake.without_imu();
+        }
+        span
     }
 
     /// What the second camera saw at the same time. Images without it are counted.

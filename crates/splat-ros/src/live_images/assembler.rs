@@ -250,6 +250,9 @@ impl Assembler {
         match image_of(&image.payload, is_compressed) {
             Ok(pixels) => {
                 let imu = self.beside.take_imu(&self.camera_frame, stamp);
+                if self.beside.has_imu_topic() && imu.is_none() {
+                    intake.without_imu();
+                }
                 let extras = Extras {
                     truth: companions.truth,
                     odometry: companions.odometry,

@@ -287,6 +287,10 @@ impl Beside {
         by_tf.filter(|_| is_named).or_else(by_params)
     }
 
+    pub(crate) fn has_imu_topic(&self) -> bool {
+        !self.params.imu_topic.is_empty()
+    }
+
     /// What the IMU measured up to an image; what is before it is asked for once.
     pub(crate) fn take_imu(&self, camera_frame: &str, stamp: Stamp) -> Option<ImuSpan> {
         let mut received = lock(&self.received);
