@@ -100,9 +100,9 @@ fn an_imu_over_zenoh_gives_the_scale() {
     let folder = tempfile::tempdir().unwrap();
     let bag = folder.path().join("room.mcap");
     let settings = SynthSettings {
-        n_frames: 130,
-        width_px: 320,
-        height_px: 240,
+        n_frames: 100,
+        width_px: 240,
+        height_px: 180,
         imu: Some(1.0),
         depth: false,
         ..SynthSettings::of(SceneKind::Room)
@@ -115,13 +115,13 @@ fn an_imu_over_zenoh_gives_the_scale() {
         .args(["--set", &format!("publish.zenoh_connect={endpoint}")])
         .args(["--set", "publish.scouting=false"])
         .args(["--set", "source.imu_topic=/imu/data_raw"])
-        .args(["--set", "source.max_frames=120"])
+        .args(["--set", "source.max_frames=70"])
         .args(["--set", "map.finish_secs=0", "--out"])
         .arg(folder.path().join("out"))
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    send(&session, &bag, 125);
+    send(&session, &bag, 95);
     let output = mapper.wait_with_output().unwrap();
     let log = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{log}");

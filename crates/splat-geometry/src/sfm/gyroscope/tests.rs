@@ -117,8 +117,11 @@ fn a_start_whose_turns_are_others_does_not_fit() {
         (0..9)
             .filter_map(|view| {
                 let pose = world_from_cam(&scene, view)?;
-                let bent = DQuat::from_rotation_x(wrong * (view as f64 * 1.3).sin());
-                Some((view, Rigid::new(pose.rotation * bent, pose.translation)))
+                let wrong_turn = DQuat::from_rotation_x(wrong * (view as f64 * 1.3).sin());
+                Some((
+                    view,
+                    Rigid::new(pose.rotation * wrong_turn, pose.translation),
+                ))
             })
             .collect()
     };
