@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
-use splat_geometry::inertial::alignment::{InertialAlignment, align};
+use splat_geometry::inertial::alignment::{InertialAlignment, align_for_unit};
 use splat_geometry::inertial::frames::{Calibration, PosedFrame};
 use splat_geometry::inertial::noise::ImuNoise;
 use splat_io::frame_source::Source as _;
@@ -49,7 +49,7 @@ fn aligned(frames: &[Frame], metres_per_unit: f64) -> (InertialAlignment, DVec3)
             })
         })
         .collect();
-    let found = align(&posed, &log, &Calibration::default(), &ImuNoise::default());
+    let found = align_for_unit(&posed, &log, &Calibration::default(), &ImuNoise::default());
     (found.unwrap(), aslant * DVec3::Z)
 }
 
@@ -117,7 +117,8 @@ fn a_synthetic_imu_shows_metres_and_gravity_to_what_is_stated() {
             }
         });
         let posed: Vec<PosedFrame> = posed.collect();
-        let found = align(&posed, &log, &Calibration::default(), &ImuNoise::default()).unwrap();
+        let found =
+            align_for_unit(&posed, &log, &Calibration::default(), &ImuNoise::default()).unwrap();
         let metric = found.metric.as_ref().unwrap();
         let unit = metric.metres_per_unit.ln();
         let tilt = found.up.angle_between(DVec3::Z).to_degrees();

@@ -7,7 +7,7 @@ use rand_pcg::Pcg32;
 use crate::take::{Take, gaussian};
 use splat_types::inertial::{ImuModel, ImuSample, ImuSpan};
 use splat_types::time::Stamp;
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, rotation_vector};
 
 /// Added to the seed of a take.
 const STREAM: u64 = 0x1_3e5a;
@@ -106,13 +106,12 @@ fn exact(take: &Take, secs: f64) -> ImuSample {
     let pose = |off: f64| take.pose_at(secs + off) * mounted;
     let (before, now, after) = (pose(-HALF_STEP), pose(0.0), pose(HALF_STEP));
     let turn = before.rotation.inverse() * after.rotation;
-    let turn = if turn.w < 0.0 { -turn } else { turn };
     let acceleration =
         (before.translation + after.translation - 2.0 * now.translation) / (HALF_STEP * HALF_STEP);
     let force = acceleration + GRAVITY * DVec3::Z;
     ImuSample {
         stamp: Stamp::default(),
-        angular_velocity: turn.to_scaled_axis() / (2.0 * HALF_STEP),
+        angular_velocity: rotation_vector(turn) / (2.0 * HALF_STEP),
         acceleration: now.rotation.inverse() * force,
     }
 }

@@ -244,6 +244,16 @@ pub fn parse_transform(text: &str) -> Option<Rigid> {
     is_sound.then(|| Rigid::new(rotation / length, translation))
 }
 
+/// Axis times angle, the short way round: a quaternion and its negative are one rotation.
+pub fn rotation_vector(rotation: DQuat) -> DVec3 {
+    let short = if rotation.w < 0.0 {
+        -rotation
+    } else {
+        rotation
+    };
+    short.to_scaled_axis()
+}
+
 /// `skew(a) * b == a.cross(b)`.
 #[inline]
 pub fn skew(a: DVec3) -> DMat3 {

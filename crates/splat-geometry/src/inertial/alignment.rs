@@ -16,7 +16,7 @@ use crate::inertial::preintegration::{Bias, Preintegrated};
 use crate::inertial::turns::{self, MeasuredTurn, TurnAlignment, TurnPair};
 use splat_types::inertial::ImuLog;
 use splat_types::time::Stamp;
-use splat_types::transform::{Rigid, skew};
+use splat_types::transform::{Rigid, rotation_vector, skew};
 
 /// Turns are compared over so long.
 const TURN_SECS: f64 = 0.8;
@@ -58,8 +58,9 @@ pub enum Unaligned {
 pub struct InertialAlignment {
     /// The last frame.
     pub stamp: Stamp,
-    pub turns: TurnAlignment,
     pub calibration: Calibration,
+    /// Standard deviation of the gyroscope's bias, rad/s.
+    pub gyro_bias_std: f64,
     /// Up, as a direction in the world of the poses, and its standard deviation about each level axis, rad.
     pub up: DVec3,
     pub tilt_std: f64,
@@ -108,13 +109,75 @@ pub fn align(
     if frames.len() < MIN_FRAMES || secs < MIN_SECS {
         return Err(Unaligned::TooFew);
     }
-    let mut calibration = Calibration {
-        bias: Bias {
-            accelerometer: DVec3::ZERO,
-            ..before.bias
-        },
-        ..*before
-    };
+    let Integrated {
+        mut calibration,
+        gyro_bias_std,
+        motions,
+        lever,
+    } = integrate(frames, log, before, noise)?;
+    let metric = solve(frames, &motions, lever, noise).map(MetricAlignment::of);
+    if let Some(metric) = &metric {
+        let bias = metric.solution.vector(FORCE_BIAS);
+        calibration.bias.accelerometer = bias * metric.metres_per_unit;
+    }
+    let by_mean = mean_up(frames, &motions, noise);
+    let level = metric.as_ref().map(MetricAlignment::up).into_iter();
+    let level = level.chain(by_mean).min_by(|a, b| a.1.total_cmp(&b.1));
+    let (up, tilt_std) = level.ok_or(Unaligned::Gaps)?;
+    let last = frames.last().ok_or(Unaligned::TooFew)?;
+    let (turn, turn_std) = smoothed_turn(frames, log, &calibration, noise);
+    Ok(InertialAlignment {
+        stamp: last.stamp,
+        calibration,
+        gyro_bias_std,
+        up,
+        tilt_std,
+        metric,
+        turn,
+        turn_std,
+    })
+}
+
+/// The same, for whom the unit counts: its standard deviation is no smaller than what it hangs on single parts of the way. Takes as long
+/// again.
+///
+/// # Errors
+///
+/// As `align`.
+pub fn align_for_unit(
+    frames: &[PosedFrame],
+    log: &ImuLog,
+    before: &Calibration,
+    noise: &ImuNoise,
+) -> Result<InertialAlignment, Unaligned> {
+    let mut found = align(frames, log, before, noise)?;
+    if let Some(metric) = &mut found.metric {
+        let of = integrate(frames, log, before, noise)?;
+        let at = (of.lever, 1.0 / metric.metres_per_unit);
+        let scatter = unit_scatter(frames, &of.motions, at, noise);
+        metric.relative_std = metric.relative_std.max(scatter);
+    }
+    Ok(found)
+}
+
+/// Samples between frames with what turns show of the gyroscope.
+struct Integrated {
+    /// Without the accelerometer's bias.
+    calibration: Calibration,
+    gyro_bias_std: f64,
+    /// What lies between each two frames; `None` is a gap.
+    motions: Vec<Option<Preintegrated>>,
+    /// Where the IMU sits, in the camera's axes.
+    lever: DVec3,
+}
+
+fn integrate(
+    frames: &[PosedFrame],
+    log: &ImuLog,
+    before: &Calibration,
+    noise: &ImuNoise,
+) -> Result<Integrated, Unaligned> {
+    let mut calibration = before.with_measured_forces();
     let mut motions = motions(frames, log, &calibration, noise)?;
     let (mut turns, mut is_near) = align_turns(frames, &motions, &mut calibration, noise)?;
     if !is_near {
@@ -132,35 +195,11 @@ pub fn align(
     } else {
         self::motions(frames, log, &calibration, noise)?
     };
-    turns = TurnAlignment {
-        mount: calibration.mount,
-        delay_secs: calibration.delay_secs,
-        gyro_bias: calibration.bias.gyro,
-        ..turns
-    };
-    let lever = DQuat::from_scaled_axis(calibration.mount) * log.model().imu_in_cam;
-    let solution = solve(frames, &motions, lever, noise);
-    let scatter = |units: f64| unit_scatter(frames, &motions, (lever, units), noise);
-    let metric = solution.map(|solution| MetricAlignment::of(solution, scatter));
-    if let Some(metric) = &metric {
-        let bias = metric.solution.vector(FORCE_BIAS);
-        calibration.bias.accelerometer = bias * metric.metres_per_unit;
-    }
-    let by_mean = mean_up(frames, &motions, noise);
-    let level = metric.as_ref().map(MetricAlignment::up).into_iter();
-    let level = level.chain(by_mean).min_by(|a, b| a.1.total_cmp(&b.1));
-    let (up, tilt_std) = level.ok_or(Unaligned::Gaps)?;
-    let last = frames.last().ok_or(Unaligned::TooFew)?;
-    let (turn, turn_std) = smoothed_turn(frames, log, &calibration, noise);
-    Ok(InertialAlignment {
-        stamp: last.stamp,
-        turns,
+    Ok(Integrated {
         calibration,
-        up,
-        tilt_std,
-        metric,
-        turn,
-        turn_std,
+        gyro_bias_std: turns.gyro_bias_std,
+        lever: DQuat::from_scaled_axis(calibration.mount) * log.model().imu_in_cam,
+        motions,
     })
 }
 
@@ -278,11 +317,9 @@ fn smoothed_turn(
             break;
         };
         let other = frame.world_from_cam.rotation * motion.turn;
-        let off = turn.inverse() * other;
-        let off = if off.w < 0.0 { -off } else { off };
         let by_gyro = motion.turn_variance();
         let weight = 1.0 / (frame.std[1].powi(2) + by_gyro);
-        sum += weight * off.to_scaled_axis();
+        sum += weight * rotation_vector(turn.inverse() * other);
         weights += weight;
     }
     let turn = (turn * DQuat::from_scaled_axis(sum / weights)).normalize();
@@ -290,12 +327,11 @@ fn smoothed_turn(
 }
 
 impl MetricAlignment {
-    fn of(solution: Solution, scatter: impl Fn(f64) -> f64) -> Self {
+    fn of(solution: Solution) -> Self {
         let units = solution.values[UNITS];
-        let std = solution.covariance[(UNITS, UNITS)].sqrt() / units;
         Self {
             metres_per_unit: 1.0 / units,
-            relative_std: std.max(scatter(units)),
+            relative_std: solution.covariance[(UNITS, UNITS)].sqrt() / units,
             misfit: solution.misfit,
             solution,
         }
@@ -357,7 +393,7 @@ impl InertialAlignment {
         let step = step_covariance(&motion, &rotation, &untilted);
         // The turn of the last frame and the gyroscope's bias tilt the forces.
         let by_turn = units * rotation * skew(motion.place) * self.turn_std;
-        let by_gyro = units * rotation * motion.place_by_gyro * self.turns.gyro_bias_std;
+        let by_gyro = units * rotation * motion.place_by_gyro * self.gyro_bias_std;
         let mut place_covariance = by_turn * by_turn.transpose() + by_gyro * by_gyro.transpose();
         for column in 0..3 {
             for row in 0..3 {
@@ -381,18 +417,12 @@ impl InertialAlignment {
 
     /// Since the last frame, with forces as they were measured.
     fn motion(&self, log: &ImuLog, at: Stamp, noise: &ImuNoise) -> Option<Preintegrated> {
-        let calibration = Calibration {
-            bias: Bias {
-                accelerometer: DVec3::ZERO,
-                ..self.calibration.bias
-            },
-            ..self.calibration
-        };
+        let calibration = self.calibration.with_measured_forces();
         integrated(log, &calibration, (self.stamp, at), noise)
     }
 
     fn turn_std_after(&self, motion: &Preintegrated) -> f64 {
-        let by_bias = self.turns.gyro_bias_std * motion.secs;
+        let by_bias = self.gyro_bias_std * motion.secs;
         (self.turn_std.powi(2) + by_bias.powi(2) + motion.turn_variance()).sqrt()
     }
 }

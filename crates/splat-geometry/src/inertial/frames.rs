@@ -27,6 +27,19 @@ pub struct Calibration {
     pub delay_secs: f64,
 }
 
+impl Calibration {
+    /// The same without the accelerometer's bias: an unknown of the filter, which takes forces as they were measured.
+    pub(crate) fn with_measured_forces(&self) -> Self {
+        Self {
+            bias: Bias {
+                accelerometer: DVec3::ZERO,
+                ..self.bias
+            },
+            ..*self
+        }
+    }
+}
+
 /// Samples as they are before a calibration, from one time to another, calibrated.
 fn samples(
     log: &ImuLog,

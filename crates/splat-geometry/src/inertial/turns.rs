@@ -10,6 +10,7 @@ use nalgebra::{SMatrix, SVector};
 use crate::inertial::noise::ImuNoise;
 use crate::inertial::preintegration::Preintegrated;
 use crate::stats::median;
+use splat_types::transform::rotation_vector;
 
 /// Standard deviations of what is believed before: turn of the mount in radians, delay in seconds.
 const MOUNT_STD: f64 = 0.01;
@@ -153,9 +154,7 @@ impl TurnPair {
         let vector = |i: usize| DVec3::new(at[i], at[i + 1], at[i + 2]);
         let measured = &self.measured;
         let turn = measured.corrected(vector(0), vector(3), at[6]);
-        let off = turn.inverse() * self.seen;
-        let off = if off.w < 0.0 { -off } else { off };
-        let residual = off.to_scaled_axis();
+        let residual = rotation_vector(turn.inverse() * self.seen);
         // To first order of small residuals, which is enough to converge by.
         let back = DMat3::from_quat(turn.inverse());
         let by_mount = back - DMat3::IDENTITY;

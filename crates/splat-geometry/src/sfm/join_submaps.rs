@@ -6,7 +6,7 @@ use crate::sfm::adjust::adjust_global;
 use crate::sfm::limits::Limits;
 use crate::sfm::odometry::{MAX_MISFIT, in_time, metres_per_unit, misfit, motion, world_from_cam};
 use crate::sfm::reconstruction::Reconstruction;
-use splat_types::transform::{Rigid, Similarity};
+use splat_types::transform::{Rigid, Similarity, rotation_vector};
 
 /// A submap whose unit is known no better is not joined to another.
 const MAX_SCALE_STD: f64 = 0.03;
@@ -118,11 +118,8 @@ fn crossing(scene: &Reconstruction, stays: &Joinable, gone: &Joinable) -> Option
     }
     let total: f64 = found.iter().map(|f| f.3).sum();
     let first = found[0].0;
-    let off = |f: &(DQuat, DVec3, Rigid, f64)| {
-        let off = first.inverse() * f.0;
-        let off = if off.w < 0.0 { -off } else { off };
-        off.to_scaled_axis() * (f.3 / total)
-    };
+    let off =
+        |f: &(DQuat, DVec3, Rigid, f64)| rotation_vector(first.inverse() * f.0) * (f.3 / total);
     let mean: DVec3 = found.iter().map(off).sum();
     let rotation = first * DQuat::from_scaled_axis(mean);
     // Where the origin goes is known best by where the keyframes near the gap go.

@@ -1,7 +1,7 @@
 //! What an IMU measured between keyframes, and where the map has them -> metres of one map unit.
 
 use crate::mapper::keyframes::registered::RegisteredKeyframe;
-use splat_geometry::inertial::alignment::{MetricAlignment, align};
+use splat_geometry::inertial::alignment::{MetricAlignment, align, align_for_unit};
 use splat_geometry::inertial::frames::{Calibration, PosedFrame};
 use splat_geometry::inertial::noise::ImuNoise;
 use splat_geometry::length_ratio::LogRatio;
@@ -66,14 +66,14 @@ fn by_own_misfit(frames: &mut [PosedFrame], log: &ImuLog) -> Option<MetricAlignm
     };
     let mut steps: Vec<f64> = frames.windows(2).map(step).collect();
     let mut std = FIRST_STD * median(&mut steps)?.max(1e-9);
-    let mut found = None;
-    for _ in 0..N_ROUNDS {
+    let calibration = Calibration::default();
+    for _ in 1..N_ROUNDS {
         frames.iter_mut().for_each(|frame| frame.std[0] = std);
-        let metric = align(frames, log, &Calibration::default(), &noise)
-            .ok()?
-            .metric?;
+        let metric = align(frames, log, &calibration, &noise).ok()?.metric?;
         std *= metric.misfit.clamp(1.0 / MAX_FACTOR, MAX_FACTOR);
-        found = Some(metric);
     }
-    found
+    frames.iter_mut().for_each(|frame| frame.std[0] = std);
+    align_for_unit(frames, log, &calibration, &noise)
+        .ok()?
+        .metric
 }

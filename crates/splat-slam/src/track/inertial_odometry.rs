@@ -90,7 +90,7 @@ impl InertialOdometry {
             self.log.push(span);
         }
         let before = self.newest_frame.replace(frame.stamp);
-        let noise = ImuNoise::of(self.log.model());
+        let noise = self.noise();
         let motion = before.and_then(|before| {
             let times = (before, frame.stamp);
             integrated(&self.log, &self.calibration, times, &noise)
@@ -109,7 +109,7 @@ impl InertialOdometry {
     pub(crate) fn up_in_cam(&self) -> Option<DVec3> {
         let by_fit = || {
             let alignment = &self.fit.as_ref()?.alignment;
-            let noise = ImuNoise::of(self.log.model());
+            let noise = self.noise();
             let (turn, _) = alignment.predict_turn(&self.log, self.newest_frame?, &noise)?;
             Some(turn.inverse() * alignment.up)
         };
@@ -119,6 +119,10 @@ impl InertialOdometry {
         };
         let is_out = self.check.is_out();
         by_fit().or_else(by_mean).filter(|_| !is_out)
+    }
+
+    fn noise(&self) -> ImuNoise {
+        ImuNoise::of(self.log.model())
     }
 
     pub(crate) fn has_come(&self) -> bool {
@@ -142,7 +146,7 @@ impl InertialOdometry {
         if self.check.is_out() {
             return None;
         }
-        let noise = ImuNoise::of(self.log.model());
+        let noise = self.noise();
         let motion = integrated(&self.log, &self.calibration, (from, to), &noise)?;
         Some(motion.turn)
     }
@@ -196,7 +200,7 @@ impl InertialOdometry {
         pose_of: impl Fn(&Anchor) -> Option<Rigid>,
     ) -> Option<f64> {
         let measured = pose_of(&frame.anchor)?;
-        let noise = ImuNoise::of(self.log.model());
+        let noise = self.noise();
         if let Some((said, place)) = self.predict(fit, frame.stamp, &pose_of) {
             let variance = (0..3)
                 .map(|i| place.place_covariance.col(i)[i])
@@ -223,7 +227,7 @@ impl InertialOdometry {
         let Some(last) = self.measured.back().copied() else {
             return;
         };
-        let noise = ImuNoise::of(self.log.model());
+        let noise = self.noise();
         let mut frames: Vec<PosedFrame> = Vec::new();
         for frame in &self.measured {
             let is_recent = last.stamp.secs_since(frame.stamp) < DENSE_SECS;
@@ -267,7 +271,7 @@ impl InertialOdometry {
         if !(0.0..MAX_AHEAD_SECS).contains(&secs) {
             return None;
         }
-        let noise = ImuNoise::of(self.log.model());
+        let noise = self.noise();
         let predicted = fit.alignment.predict(&self.log, at, &noise)?;
         // The map may have moved since.
         let moved = pose_of(&fit.anchor)? * fit.world_from_cam.inverse();

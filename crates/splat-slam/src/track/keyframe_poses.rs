@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, VecDeque};
 use nalgebra::{Matrix6, Vector6};
 
 use crate::track::anchor::Anchor;
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, rotation_vector};
 
 /// A keyframe has its place when so many newer ones have theirs.
 const SETTLED: usize = 10;
@@ -128,12 +128,7 @@ impl Revisions {
 }
 
 fn motion(moved: &Rigid) -> [f64; 6] {
-    let turned = if moved.rotation.w < 0.0 {
-        -moved.rotation
-    } else {
-        moved.rotation
-    };
-    let (shift, turn) = (moved.translation, turned.to_scaled_axis());
+    let (shift, turn) = (moved.translation, rotation_vector(moved.rotation));
     [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z]
 }
 

@@ -3,8 +3,9 @@
 use glam::{DQuat, DVec3};
 use nalgebra::Matrix6;
 
+use crate::visual_odometry::odometry::turned_by;
 use splat_types::time::Stamp;
-use splat_types::transform::Rigid;
+use splat_types::transform::{Rigid, rotation_vector};
 
 /// Motions are carried on over so many times the interval that they were measured over, then the camera counts as
 /// standing: what was a swing of a tenth of a second says nothing of the next second.
@@ -52,7 +53,7 @@ impl Motion {
             return self.cam_from_world;
         };
         let share = (stamp.secs_since(self.stamp) / secs).clamp(0.0, MAX_AHEAD);
-        let turn = turn_of(step) * share;
+        let turn = rotation_vector(step.rotation) * share;
         let next = Rigid::exp(DVec3::ZERO, turn) * self.cam_from_world;
         Rigid::new(next.rotation, next.translation + step.translation * share).renormalized()
     }
@@ -63,16 +64,14 @@ impl Motion {
         let Some(turn) = turn else {
             return ahead;
         };
-        let place = ahead.inverse().translation;
-        let rotation = (turn.inverse() * self.cam_from_world.rotation).normalize();
-        Rigid::new(rotation, -(rotation * place))
+        turned_by(&ahead, &self.cam_from_world, turn)
     }
 
     /// How far off `ahead` may be: the last pose's own covariance, and a motion that is as unknown as it is large.
     pub(crate) fn covariance_ahead(&self, stamp: Stamp, scene_depth: f64) -> Matrix6<f64> {
         let secs = stamp.secs_since(self.stamp).max(0.0);
         let (speed, turn_rate) = self.step.as_ref().map_or((0.0, 0.0), |(step, secs)| {
-            let turn = turn_of(step).length();
+            let turn = rotation_vector(step.rotation).length();
             (step.translation.length() / secs, turn / secs)
         });
         let far = speed.max(MIN_SPEED_DEPTHS * scene_depth) * secs;
@@ -114,17 +113,6 @@ impl Motion {
             }
         }
     }
-}
-
-/// Axis times angle, the short way round: a quaternion and its negative are one rotation.
-fn turn_of(step: &Rigid) -> DVec3 {
-    let rotation = step.rotation;
-    let short = if rotation.w < 0.0 {
-        -rotation
-    } else {
-        rotation
-    };
-    short.to_scaled_axis()
 }
 
 #[cfg(test)]

@@ -193,9 +193,7 @@ impl VisualOdometry {
         let Some(turn) = turn_since(at) else {
             return Some(on);
         };
-        let place = on.inverse().translation;
-        let rotation = (turn.inverse() * pose.rotation).normalize();
-        Some(Rigid::new(rotation, -(rotation * place)))
+        Some(turned_by(&on, &pose, turn))
     }
 
     /// The frame whose corners were followed last.
@@ -319,4 +317,11 @@ impl VisualOdometry {
             first: BTreeMap::new(),
         };
     }
+}
+
+/// A camera that stands where one is predicted to be, and has turned by `turn` (`earlier_from_later`) since one before.
+pub(crate) fn turned_by(predicted: &Rigid, before: &Rigid, turn: DQuat) -> Rigid {
+    let place = predicted.inverse().translation;
+    let rotation = (turn.inverse() * before.rotation).normalize();
+    Rigid::new(rotation, -(rotation * place))
 }

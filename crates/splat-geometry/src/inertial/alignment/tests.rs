@@ -311,7 +311,7 @@ fn gaps_leave_what_is_known_before_and_after() {
         samples: whole.samples.iter().copied().filter(is_there).collect(),
         ..whole
     });
-    let found = align(&way.frames(), &log, &Calibration::default(), &way.noise()).unwrap();
+    let found = align_for_unit(&way.frames(), &log, &Calibration::default(), &way.noise()).unwrap();
     assert!(
         (metric(&found).metres_per_unit / METRES_PER_UNIT)
             .ln()
@@ -326,14 +326,14 @@ fn gaps_leave_what_is_known_before_and_after() {
         samples: whole.samples.iter().copied().filter(is_there).collect(),
         ..whole
     });
-    let found = align(&way.frames(), &log, &Calibration::default(), &way.noise()).unwrap();
+    let found = align_for_unit(&way.frames(), &log, &Calibration::default(), &way.noise()).unwrap();
     let unit = (metric(&found).metres_per_unit / METRES_PER_UNIT).ln();
     assert!(
         unit.abs() < 3.0 * metric(&found).relative_std && unit.abs() < 0.03,
         "{found:?}"
     );
     let none = ImuLog::new(10.0);
-    let empty = align(&way.frames(), &none, &Calibration::default(), &way.noise());
+    let empty = align_for_unit(&way.frames(), &none, &Calibration::default(), &way.noise());
     assert_eq!(empty.err(), Some(Unaligned::Gaps));
 }
 

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3};
 
 use crate::optim::bundle::problem::{Camera, Flat, RelativeMotion};
 use crate::optim::bundle::reduced::{HELD, Layout, System};
-use splat_types::transform::{Rigid, skew};
+use splat_types::transform::{Rigid, rotation_vector, skew};
 
 /// Standard deviations at which the loss bends. Observations bend at their `loss_px`, so that one standard deviation of a motion
 /// counts as a third of that in pixels, which is about what a good match is off by.
@@ -45,9 +45,7 @@ impl RelativeMotion {
 
     /// The turn that is left over, as the rotation vector of the shorter way round.
     fn turned(&self, between: &Rigid) -> DVec3 {
-        let off = self.first_from_second.rotation.inverse() * between.rotation;
-        let off = if off.w < 0.0 { -off } else { off };
-        off.to_scaled_axis()
+        rotation_vector(self.first_from_second.rotation.inverse() * between.rotation)
     }
 
     fn derivatives(&self, between: &Rigid) -> ByPose {

@@ -1,6 +1,6 @@
 //! What edges two nodes of a pose graph to each other, and by how much they miss it.
 
-use splat_types::transform::Similarity;
+use splat_types::transform::{Similarity, rotation_vector};
 
 /// Place, turn and scale.
 pub(crate) const DOF: usize = 7;
@@ -94,13 +94,8 @@ pub(crate) fn square(residual: &[f64; DOF]) -> f64 {
 /// In standard deviations: place, turn, logarithm of scale.
 pub(crate) fn residual(edge: &Edge, a: &Similarity, b: &Similarity) -> [f64; DOF] {
     let off = edge.first_from_second.inverse() * (a.inverse() * *b);
-    // The short way round; the angle of the logarithm stays below a half turn.
-    let rotation = if off.rotation.w < 0.0 {
-        -off.rotation
-    } else {
-        off.rotation
-    };
-    let turn = rotation.to_scaled_axis() / edge.std[1];
+    // The angle of the logarithm stays below a half turn.
+    let turn = rotation_vector(off.rotation) / edge.std[1];
     let shift = off.translation / edge.std[0];
     [
         shift.x,
